@@ -20,9 +20,9 @@ from slam_backend.geometry import inverse, transform_points, wrap_angle
 from slam_backend.metrics import map_rmse, nees
 from studies.bounds.episodes import NONE, FilterTrack, RecordedEpisode, record_episode, replay
 from studies.bounds.ladder import LADDER, estimates, with_all_keyframes
-from training.bench.config import with_absolute_paths, world_split
-from training.bench.exploration.players import BOUND, parted
-from training.commands._plan import first_steps
+from training.bench.exploration.config import with_absolute_paths
+from training.bench.exploration.players import BOUND, parted, world_split
+from training.bench.exploration.trials import first_steps
 from training.commands.study import run_program
 from training.episodes.config import RunConfig
 from training.episodes.guard import PolicyError

@@ -16,10 +16,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from training.bench.config import ANY_SPLIT
+from training.bench.exploration.config import ANY_SPLIT
 from training.bench.exploration.players import parted
-from training.bench.exploration.trials import CURVE_POINTS, TEAM, count_merges, pose_errors, values_at
-from training.commands._plan import first_steps
+from training.bench.exploration.trials import CURVE_POINTS, TEAM, count_merges, first_steps, pose_errors, values_at
 from training.commands.study import run_program
 from training.episodes.config import RunConfig
 from training.episodes.guard import PolicyError

@@ -43,6 +43,12 @@ def _check_workers(number: int) -> int:
 Workers = Annotated[
     int, typer.Option(help="Number of processes; each runs a trial at a time.", callback=_check_workers)
 ]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        help="Address of a Ray cluster that plays the episodes, or auto; see ray start.", show_default="this machine"
+    ),
+]
 
 
 def options(

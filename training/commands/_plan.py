@@ -1,24 +1,22 @@
 """Runs of benchmark plans, repetition of their episodes, and the leaderboard."""
 
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
-from training.bench.config import ExplorationBenchConfig, ExplorationTrial, PlanBenchConfig
-from training.commands._progress import TrialSet, run_trial_sets, trial_progress
+from training.bench.exploration.config import ExplorationConfig, PlanConfig, Trial
+from training.commands._progress import TrialSet, run_trial_set, trial_progress
 from training.commands._run_folder import Call
+from training.commands.study import plain_lines, print_table
 from training.experiments.console import print_error
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.bench.exploration.plan import Plan
-    from training.bench.exploration.players import Player
-    from vslam_env.config import EnvConfig
 
 COMMAND = "bench exploration"
 EPISODES_CSV, EPISODES_PARQUET = "episodes.csv", "episodes.parquet"
@@ -26,12 +24,6 @@ OPEN = ("policies", "decision_limit")  # options that a plan leaves open
 
 PlanName = Annotated[
     str | None, typer.Option(help="Plan of a benchmark: vslam-bench-v0, or a TOML file.", show_default="none")
-]
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        help="Address of a Ray cluster that plays the episodes, or auto; see ray start.", show_default="this machine"
-    ),
 ]
 Verified = Annotated[
     Path | None, typer.Option(help="Run folder whose episodes are played again and compared.", show_default=False)
@@ -41,23 +33,22 @@ VerifiedRows = Annotated[
 ]
 
 
-def is_plan_run(call: Call[ExplorationBenchConfig]) -> bool:
+def is_plan_run(call: Call[ExplorationConfig]) -> bool:
     """Return whether the configuration in --config is that of a plan."""
     from training.experiments.run_folder import read_config
 
     return call.file is not None and "plan" in read_config(call.file, COMMAND)[0]
 
 
-def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int, cluster: str | None) -> None:
+def run_plan(call: Call[ExplorationConfig], name: str | None, workers: int, cluster: str | None) -> None:
     """Play the episodes of a plan that the run folder does not contain yet, and write its tables."""
     from slam_backend.core.text_files import read_text
     from training.bench.exploration.plan import PLAN_COPY, PlanBench, PlanTrial
-    from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
-    from training.bench.exploration.players import parted
-    from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
+    from training.bench.exploration.plan_report import draw_plan, episodes_csv, markdown, ordered, tables, write_parquet
+    from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, checks, play
     from training.experiments.numerics import PORTABLE, variables_for
     from training.experiments.policy_names import check_named
-    from training.experiments.run_folder import plain
+    from training.experiments.tables import E_SCALE
 
     config, plan = _configured(call, name)
     _check_same_plan(call.out, plan)
@@ -65,11 +56,8 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     check_named((trial.policy for trial in trials), call.given.get("policies"))
     check_same_policies(call.out, {trial.policy for trial in trials})
     bench = PlanBench(plan, config.decision_limit)
-    firsts = {(t.policy, t.family, t.robots): t for t in reversed(trials) if t.part == trials[0].part}.values()
-    console, folder = call.begin(
-        *(partial(first_steps, bench.environment(t), parted(t.policy), t.seed, bench.decision_limit) for t in firsts),
-        config=config,
-    )
+    first_part = [trial for trial in trials if trial.part == trials[0].part]
+    console, folder = call.begin(*checks(bench, first_part), config=config)
     if (file := Path(config.plan)).is_file():
         folder.write_text(PLAN_COPY, read_text(file, "plan", "a TOML file"))
     if missing := plan.missing_floor_plans():
@@ -80,9 +68,13 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
         variables=variables_for(PORTABLE),
         tell=lambda row: f"{row['part']}, {row['family']}, {row['policy']}, seed {row['seed']}",
     )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part)
-    _print_sections(console, plan, rows)
-    call.write({"plan": plan.name, "plan_hash": plan.digest, "summary": plain(aggregate(plan, rows))})
+    rows = run_trial_set(console, folder, part)
+    found = [(table, lines) for table in tables(plan, rows) if (lines := table.lines(ordered(rows)))]
+    for table, lines in found[:1]:  # as far as it fits into 80 columns
+        print_table(console, replace(table, columns=table.columns[:3]), lines)
+    console.print(E_SCALE)
+    by_name = {table.name: plain_lines(lines) for table, lines in found}
+    call.write({"plan": plan.name, "plan_hash": plan.digest, "tables": by_name})
     folder.write_text(EPISODES_CSV, episodes_csv(rows))
     if rows and not write_parquet(folder.path / EPISODES_PARQUET, rows):
         text = f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
@@ -94,23 +86,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
         raise typer.Exit(2)
 
 
-def _print_sections(console: Console, plan: "Plan", rows: list[dict[str, Any]]) -> None:
-    """Print the main table, as far as it fits into 80 columns, and where the others are."""
-    from training.bench.exploration.plan_report import sections
-    from training.experiments.tables import E_SCALE, console_table
-
-    for section in sections(plan, rows)[:1]:
-        few = range(min(4, len(section.headings)))
-        console.print(
-            console_table(
-                section.title, [section.headings[i] for i in few], [[r[i] for i in few] for r in section.rows]
-            )
-        )
-        console.print(section.note, soft_wrap=False)
-    console.print(E_SCALE)
-
-
-def _configured(call: Call[ExplorationBenchConfig], name: str | None) -> "tuple[PlanBenchConfig, Plan]":
+def _configured(call: Call[ExplorationConfig], name: str | None) -> "tuple[PlanConfig, Plan]":
     """Return the configuration of a run of a plan, and the plan.
 
     Raises:
@@ -131,7 +107,7 @@ def _configured(call: Call[ExplorationBenchConfig], name: str | None) -> "tuple[
     values |= {"plan": name} if name is not None else {}
     values |= {"quick": True} if call.quick else {}
     plan = Plan.load(values["plan"])
-    config = PlanBenchConfig.from_mapping(values | {"plan_hash": plan.digest})
+    config = PlanConfig.from_mapping(values | {"plan_hash": plan.digest})
     if earlier.get("plan") == config.plan and earlier["plan_hash"] != plan.digest:
         hint = "Use the release that wrote it."
         raise argument_error("config", f"a run of plan {plan.digest}", earlier["plan_hash"], hint)
@@ -155,7 +131,7 @@ def _check_same_plan(out: Path | None, plan: "Plan") -> None:
         raise argument_error("out", f"results of vslam-env {now}", f"results of {before}", hint)
 
 
-def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, workers: int) -> None:
+def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int, workers: int) -> None:
     """Play some episodes of each policy of a run again, and compare them with what the run stored.
 
     Processes that play them have the numerics of the stored ones, where this processor can do these.
@@ -169,23 +145,22 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     from training.bench.exploration.leaderboard import kept_episodes
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import TRIALS_FILE, Bench, play
-    from training.bench.exploration.verification import HEADINGS, choose, compare, keep, table_rows
+    from training.bench.exploration.verification import TABLE, choose, compare, keep
     from training.experiments.numerics import variables_for
     from training.experiments.policy_names import check_named
     from training.experiments.run_folder import CONFIG_FILE, read_config
     from training.experiments.statistics import grouped
-    from training.experiments.tables import console_table
     from training.experiments.trial_store import FAILED, finished_trials, run_in_processes, trial_of
 
     values, seed = read_config(folder, COMMAND, "verify")
     check_named(values.get("policies") or (), call.given.get("policies"))
     bench: Bench
-    kind: type[Any] = ExplorationTrial
+    kind: type[Any] = Trial
     if "plan" in values:
         plan = Plan.of_run(folder, values, "verify")
         bench, kind = PlanBench(plan, float(values["decision_limit"])), PlanTrial
     else:
-        bench = ExplorationBenchConfig.from_mapping(values | {"seed": seed})
+        bench = ExplorationConfig.from_mapping(values | {"seed": seed})
     stored = finished_trials(folder / TRIALS_FILE, kind)
     chosen = choose(list(stored.values()) or kept_episodes(folder) or [], count, np.random.default_rng())
     if not chosen or any("digest" not in row for row in chosen):
@@ -207,7 +182,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
                     outcomes.append(compare(rows[trial], again))
                     keep(folder, outcomes[-1], asdict(trial))
                     advance(f"{trial.policy}, seed {trial.seed}")
-    call.console.print(console_table("Episodes played again", HEADINGS, table_rows(outcomes)))
+    print_table(call.console, TABLE, TABLE.lines(outcomes))
     others = sorted({(row["stored_on"], row["machine"]) for row in outcomes if row["is_equal"] is None})
     for stored_on, here in others:
         text = f"Other numerics or versions, so that last bits may differ: {stored_on}. Here: {here}."
@@ -241,25 +216,3 @@ def write_leaderboard(folders: list[Path], out: Path) -> None:
     write_file(out, leaderboard(results, figure.name), "out")
     draw_plan(figure, played_rows(results))
     typer.echo(f"Leaderboard: {out}")
-
-
-def first_steps(environment: "EnvConfig", player: "Player", seed: int, decision_limit: float) -> None:
-    """Run the first two steps of an episode, to detect worlds that cannot be built, and compile what its policy needs.
-
-    The trial itself reports a policy that fails.
-    """
-    from contextlib import suppress
-
-    from training.bench.exploration.players import BOUND
-    from training.episodes.guard import PolicyError
-    from training.episodes.runner import run_episode
-    from vslam_env import vslam_v1
-
-    steps = iter(range(2))
-    if player.role == BOUND:
-        return
-    env = vslam_v1.parallel_env(config=environment)
-    with suppress(PolicyError):
-        team = player.make(env, decision_limit)
-        run_episode(env, team, seed, should_stop=lambda: next(steps, None) is None)
-    env.close()

@@ -29,7 +29,7 @@ def trial_progress(
             process runs during a trial.
 
     Yields:
-        A function that counts a trial by its name and its share of `total`, and a function that returns whether Ctrl-C
+        A function that counts a trial by its name, and a function that returns whether Ctrl-C
         was pressed.
     """
     from threadpoolctl import threadpool_limits
@@ -48,12 +48,12 @@ def trial_progress(
         task = progress.add_task("", total=total, completed=completed)
         drawn = 0.0
 
-        def advance(name: str, by: int = 1) -> None:
+        def advance(name: str) -> None:
             nonlocal drawn
             now = time.monotonic()
             redraw = now - drawn >= REDRAW_S
             drawn = now if redraw else drawn
-            progress.update(task, description=name, advance=by, refresh=redraw)
+            progress.update(task, description=name, advance=1, refresh=redraw)
 
         yield advance, interrupted
 
@@ -68,67 +68,55 @@ class TrialSet:
     play: Callable[[Any], dict[str, Any]]
     trials: Sequence[Any]  # All trials, in order
     tell: Callable[[dict[str, Any]], str]  # Short description of a row
-    cost: Callable[[Any], int] = lambda trial: 1  # Approximate cost of a trial, in an arbitrary unit
     workers: int = 1  # Number of parallel processes; 1: this process, unless there are variables
     cluster: str | None = None  # Address of a Ray cluster that runs the trials instead; None: this machine
     variables: Mapping[str, str] | None = None  # Variables of the environment of the processes that run the trials
     failures: list[str] = field(default_factory=list)  # Errors of failed trials, appended as they end
 
 
-def run_trial_sets(
-    console: Console, folder: "RunFolder", *parts: TrialSet, timed: bool = False
-) -> list[list[dict[str, Any]]]:
+def run_trial_set(console: Console, folder: "RunFolder", part: TrialSet, timed: bool = False) -> list[dict[str, Any]]:
     """Run the trials that a folder does not contain yet, under a bar; after Ctrl-C, print how to resume.
 
     Returns:
-        Rows of all finished trials of each part, in the order of the trials.
+        Rows of all finished trials, in the order of the trials.
     """
     from training.experiments.trial_store import owned
 
     with owned(folder.path):
-        return _run_owned(console, folder, parts, timed)
+        return _run_owned(console, folder, part, timed)
 
 
-def _run_owned(
-    console: Console, folder: "RunFolder", parts: Sequence[TrialSet], timed: bool
-) -> list[list[dict[str, Any]]]:
-    """Run the missing trials of a folder that no other process uses; see `run_trial_sets`."""
+def _run_owned(console: Console, folder: "RunFolder", part: TrialSet, timed: bool) -> list[dict[str, Any]]:
+    """Run the missing trials of a folder that no other process uses; see `run_trial_set`."""
     from training.experiments.trial_store import FAILED, finished_trials, run_trials, trial_of
 
-    kept = [finished_trials(folder.path / part.file, part.kind) for part in parts]
-    total = sum(part.cost(trial) for part in parts for trial in part.trials)
-    done = sum(part.cost(t) for part, found in zip(parts, kept, strict=True) for t in part.trials if t in found)
-    stored, wanted = sum(map(len, kept)), sum(len(part.trials) for part in parts)
-    if stored:
-        text = f"Resuming {folder.path}: {stored} of {wanted} trials are finished, {wanted - stored} are left."
+    found = finished_trials(folder.path / part.file, part.kind)
+    left, wanted = [trial for trial in part.trials if trial not in found], len(part.trials)
+    if found:
+        text = f"Resuming {folder.path}: {wanted - len(left)} of {wanted} trials are finished, {len(left)} are left."
         console.print(text, soft_wrap=True)
-    with trial_progress(console, total, done, timed) as (advance, interrupted):
-        for part, found in zip(parts, kept, strict=True):
+    with trial_progress(console, wanted, wanted - len(left), timed) as (advance, interrupted):
 
-            def on_trial(row: dict[str, Any], part: TrialSet = part, found: dict[Any, Any] = found) -> None:
-                trial = trial_of(row, part.kind)
-                if FAILED in row:
-                    if row[FAILED] not in part.failures:  # once, even if it fails in each trial
-                        print_error(row[FAILED], console)
-                    part.failures.append(row[FAILED])
-                    advance("failed", part.cost(trial))
-                    return
-                found[trial] = row
-                LOGGER.debug("Finished %s", part.tell(row))
-                advance(part.tell(row), part.cost(trial))
+        def on_trial(row: dict[str, Any]) -> None:
+            if FAILED in row:
+                if row[FAILED] not in part.failures:  # once, even if it fails in each trial
+                    print_error(row[FAILED], console)
+                part.failures.append(row[FAILED])
+                advance("failed")
+                return
+            found[trial_of(row, part.kind)] = row
+            LOGGER.debug("Finished %s", part.tell(row))
+            advance(part.tell(row))
 
-            left = [trial for trial in part.trials if trial not in found]
-            run_trials(
-                folder, part.file, part.play, left, part.workers, interrupted, on_trial, part.cluster, part.variables
-            )
-    rows = [[found[t] for t in part.trials if t in found] for part, found in zip(parts, kept, strict=True)]
-    finished = sum(map(len, rows))
-    failed = sum(len(part.failures) for part in parts)
-    if failed:
+        run_trials(
+            folder, part.file, part.play, left, part.workers, interrupted, on_trial, part.cluster, part.variables
+        )
+    rows = [found[trial] for trial in part.trials if trial in found]
+    if failed := len(part.failures):
         text = f"{failed} of {wanted} trials failed; the same command with --out {folder.path} repeats them."
         console.print(text, soft_wrap=True)
-    if finished + failed < wanted:
-        text = f"Stopped after {finished} of {wanted} trials; resume with --out {folder.path}."
+    if len(rows) + failed < wanted:
+        text = f"Stopped after {len(rows)} of {wanted} trials; resume with --out {folder.path}."
         console.print(text, soft_wrap=True)
     return rows
 

@@ -4,7 +4,7 @@ from functools import partial
 from typing import Any
 
 from training.commands._options import Workers, options
-from training.commands._progress import TrialSet, run_trial_sets
+from training.commands._progress import TrialSet, run_trial_set
 from training.commands._run_folder import Call
 from training.rl.config import EvaluateConfig, EvaluateTrial
 
@@ -34,7 +34,7 @@ def evaluate(call: Call[EvaluateConfig], workers: Workers = 1) -> None:
         file=TRIALS_FILE, kind=EvaluateTrial, play=partial(play, chosen), trials=chosen.trials(), workers=workers,
         tell=lambda row: f"{row['policy']}, seed {row['seed']}: return {row['return']:.3f}",
     )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part)
+    rows = run_trial_set(console, folder, part)
     lines, ahead = plain(summarise(rows)), plain(leads(rows))
     print_evaluation(console, lines, ahead, env.config.world_split)
     call.write({"policies": lines, "leads": ahead, "trials": rows})

@@ -1,12 +1,12 @@
 """Commands `vslam paper ...`: figures of the paper, reproduced in simulation."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from training.commands._options import Check, Workers, options
-from training.commands._progress import TrialSet, run_trial_sets
 from training.commands._run_folder import Call
+from training.commands.study import run_study, write_tables
 from training.paper.config import Fig1Config, Fig2Config, Fig5Config, Fig6Config, PairConfig
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
@@ -19,19 +19,14 @@ paper = typer.Typer(help="Reproduce figures of the paper.", no_args_is_help=True
 @options(Fig1Config, "paper fig1")
 def fig1(call: Call[Fig1Config]) -> None:
     """Reproduce Fig. 1: particles along the paths of three robots, with odometry only and with measurements."""
-    from training.paper.fig1 import draw_clouds, draw_fig1, path_errors, simulate_fig1
+    from training.paper.fig1 import TABLE, draw_clouds, draw_fig1, path_errors, simulate_fig1
 
-    console, folder = call.begin()
+    _, folder = call.begin()
     run = simulate_fig1(call.config)
     moved, measured = (draw_clouds(run, call.config, with_measurements) for with_measurements in (False, True))
     panels = [("motion model alone (Eq. 4)", "odometry", moved), ("with measurements", "estimate", measured)]
+    write_tables(call, [TABLE], [row for _, name, clouds in panels for row in path_errors(run, clouds, name)])
     draw_fig1(folder.path / "fig1.png", run, panels)
-    found = {"odometry": path_errors(run, moved), "measurements": path_errors(run, measured)}
-    for name, rows in found.items():
-        for robot, row in enumerate(rows, 1):
-            text = f"robot {robot}, {name}: path RMS {row['path_rms_m']:.2f} m, final error"
-            console.print(f"{text} {row['end_error_m']:.2f} m, final spread {row['end_spread_m']:.2f} m")
-    call.write(found)
     call.finish()
 
 
@@ -44,45 +39,21 @@ def fig2(call: Call[Fig2Config], check: Check = False) -> None:
     zero error for any size, is checked. The same command with --out FOLDER resumes a run that Ctrl-C has
     stopped.
     """
-    from training.experiments.run_folder import plain
-    from training.experiments.tables import number
-    from training.paper import fig2 as figure
+    from training.paper.fig2 import STUDY
 
-    console, folder = call.begin()
-    part = TrialSet(
-        file=figure.TRIALS_FILE, kind=figure.Fig2Trial, play=figure.play, trials=call.config.trials(),
-        tell=lambda row: f"seed {row['seed']}",
-    )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part)
-    lines, poor = figure.summarise(rows), figure.refusals(rows)
-    claims = plain(figure.check_claims(lines))
-    for claim in claims:
-        held = "holds" if claim["holds"] else "does not hold"
-        shown = f"{number(claim['measured'])}, at most {claim['at_most']:g}: {held}"
-        console.print(f"{claim['claim']}: {shown}")
-    text = f"At {poor['share_too_little']} stages the maps share too little; false alignments of ours: {poor['false']}."
-    console.print(text)
-    call.write({"summary": lines, "claims": claims} | poor)
-    folder.write_text("fig2.csv", figure.to_csv(rows))
-    figure.draw_fig2(folder.path / "fig2.png", plain(lines))
-    call.finish(check, [claim["holds"] for claim in claims])
+    run_study(call, STUDY, check=check)
 
 
 @paper.command("fig3")
 @options(PairConfig, "paper fig3")
 def fig3(call: Call[PairConfig]) -> None:
     """Reproduce Fig. 3: maps of two robots, the matches between them, and the estimated transform."""
-    from training.paper.fig3 import draw_fig3, matches_csv
+    from training.paper.fig3 import MATCHES, draw_fig3, matches
 
     pair = _align(call)
-    figures = pair.figures()
-    call.console.print(
-        f"{figures['inliers']} matches, {figures['true_inliers']} of them true; transform error "
-        f"{figures['translation_error_m']:.3f} m and {figures['rotation_error_deg']:.2f} degrees"
-    )
-    call.folder.write_text("fig3.csv", matches_csv(pair))
+    errors = dict(zip(("translation_m", "rotation_deg"), pair.errors(), strict=True)) | {"seed": call.config.seed}
+    write_tables(call, [MATCHES], [row | errors for row in matches(pair)])
     draw_fig3(call.folder.path / "fig3.png", pair)
-    call.write(figures)
     call.finish()
 
 
@@ -90,19 +61,11 @@ def fig3(call: Call[PairConfig]) -> None:
 @options(PairConfig, "paper fig4")
 def fig4(call: Call[PairConfig]) -> None:
     """Reproduce Fig. 4: covariance ellipses of landmarks of two aligned maps, before and after fusion."""
-    import numpy as np
-
-    from training.paper.fig3 import draw_fig4, ellipses_csv, fuse_pair
+    from training.paper.fig3 import ELLIPSES, draw_fig4, ellipses, fuse_pair
 
     fused = fuse_pair(_align(call))
-    areas = 1e4 * np.sqrt(np.linalg.det(fused.covariances[..., :2, :2]))
-    for name, one, two, both in zip(fused.true_ids.tolist(), *areas, strict=True):
-        text = f"landmark {name}: {one:.2f} and {two:.2f} square centimetres before, {both:.2f} after fusion"
-        call.console.print(text)
-    call.folder.write_text("fig4.csv", ellipses_csv(fused))
+    write_tables(call, [ELLIPSES], ellipses(fused))
     draw_fig4(call.folder.path / "fig4.png", fused)
-    areas_cm2 = dict(zip(("map_1", "map_2", "fused"), areas, strict=True))
-    call.write({"names": fused.true_ids, "sqrt_det_cm2": areas_cm2})
     call.finish()
 
 
@@ -119,21 +82,12 @@ def _align(call: Call[PairConfig]) -> "AlignedPair":
 @options(Fig5Config, "paper fig5")
 def fig5(call: Call[Fig5Config]) -> None:
     """Reproduce Fig. 5: robots in a room with landmarks on its walls, which landmarks they see and which are hidden."""
-    from training.paper.fig5 import draw_fig5, simulate_fig5
+    from training.paper.fig5 import TABLE, draw_fig5, simulate_fig5
 
-    console, folder = call.begin()
+    _, folder = call.begin()
     found = simulate_fig5(call.config)
+    write_tables(call, [TABLE], found.rows(), landmarks=len(found.landmarks))
     draw_fig5(folder.path / "fig5.png", found)
-    folder.write_text("fig5.csv", found.to_csv())
-    rows: list[dict[str, Any]] = found.figures()
-    for robot, row in enumerate(rows):
-        console.print(
-            f"robot {robot}: {row['in_view']} landmarks in view, {row['hidden']} of them hidden; "
-            f"{row['measured']} of {row['seen']} visible measured in this tick"
-        )
-    hidden, in_view = sum(row["hidden"] for row in rows), sum(row["in_view"] for row in rows)
-    console.print(f"Walls and robots hide {hidden} of {in_view} landmarks in view.")
-    call.write({"robots": rows, "landmarks": len(found.landmarks)})
     call.finish()
 
 
@@ -147,31 +101,10 @@ def fig6(call: Call[Fig6Config], workers: Workers = 1, check: Check = False) -> 
 
     The filter is the paper's (`fastslam1`, unknown association, random resampling at every step), with large noise
     relative to the odometry. Further regimes: similar landmarks with false points, and good stereo with both proposals
-    and with rejuvenation, for M = 10, 100, 1000. Map errors run in --workers at a time, times in one process. The
-    paper's claims are checked. Ctrl-C finishes the current trial and summarises the finished ones; the same command
-    with --out FOLDER resumes the run.
+    and with rejuvenation, for M = 10, 100, 1000. Times are processor times; with more --workers they also depend on
+    what shares the caches. The paper's claims are checked. Ctrl-C finishes the current trial and summarises the
+    finished ones; the same command with --out FOLDER resumes the run.
     """
-    from training.experiments.run_folder import plain
-    from training.paper.fig6.claims import check_claims, robots_ratios, summarise, to_csv
-    from training.paper.fig6.report import draw_fig6, print_result
-    from training.paper.fig6.trials import ERRORS_FILE, TIMES_FILE, ErrorTrial, TimeTrial, cost, play_error, play_time
+    from training.paper.fig6.report import STUDY
 
-    console, folder = call.begin()
-    parts = (
-        TrialSet(
-            file=ERRORS_FILE, kind=ErrorTrial, play=play_error, trials=call.config.error_trials(), workers=workers,
-            tell=lambda row: f"map errors: seed {row['seed']}, M={row['particles']}", cost=cost,
-        ),
-        TrialSet(
-            file=TIMES_FILE, kind=TimeTrial, play=play_time, trials=call.config.time_trials(),
-            tell=lambda row: f"times: seed {row['seed']}, M={row['particles']}", cost=cost,
-        ),
-    )  # fmt: skip
-    errors, times = run_trial_sets(console, folder, *parts, timed=True)
-    lines, ratios, claims = plain(summarise(errors, times)), plain(robots_ratios(errors)), check_claims(errors, times)
-    print_result(console, lines, ratios, claims)
-    call.write({"summary": lines, "robots_ratios": ratios, "claims": [claim.to_mapping() for claim in claims]})
-    folder.write_text("fig6.csv", to_csv(lines))
-    if lines:
-        draw_fig6(folder.path / "fig6.png", lines)
-    call.finish(check, [claim.holds for claim in claims])
+    run_study(call, STUDY, workers, check=check)

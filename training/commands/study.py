@@ -1,23 +1,26 @@
 """Commands of studies: options, trials, tables, chart and report, the same for all of them."""
 
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+from rich.console import Console
 
-from training.commands._options import Workers, options
-from training.commands._plan import Cluster
-from training.commands._progress import TrialSet, run_trial_sets
+from training.commands._options import Cluster, Workers, options
+from training.commands._progress import TrialSet, run_trial_set
 from training.commands._run_folder import Call
-from training.experiments.study import Study
+
+if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
+    from training.experiments.study import Claim, ResultTable, Row, Study
 
 TRIALS_FILE = "trials.jsonl"
 
 
-def command_of(study: Study[Any, Any], command: str) -> Callable[..., None]:
+def command_of(study: "Study[Any, Any]", command: str) -> Callable[..., None]:
     """Return the function of a study from which typer makes a command.
 
     Args:
@@ -40,7 +43,7 @@ def command_of(study: Study[Any, Any], command: str) -> Callable[..., None]:
     )(chosen)  # fmt: skip
 
 
-def run_program(study: Study[Any, Any]) -> None:
+def run_program(study: "Study[Any, Any]") -> None:
     """Run a study as a program with the options of its configuration; it exits as `vslam` does."""
     from training.cli import run
 
@@ -50,38 +53,72 @@ def run_program(study: Study[Any, Any]) -> None:
     run(app, f"python {Path(sys.argv[0]).name}" if spec is None else f"python -m {spec.name}")
 
 
-def run_study(call: Call[Any], study: Study[Any, Any], workers: int = 1, cluster: str | None = None) -> None:
+def run_study(
+    call: Call[Any], study: "Study[Any, Any]", workers: int = 1, cluster: str | None = None, check: bool = False
+) -> None:
     """Play the trials that the run folder lacks, and write tables, chart and report.
 
     Raises:
-        typer.Exit: With status 2 if trials failed.
+        typer.Exit: With status 2 if trials failed, or 1 if `check` is set and a claim does not hold.
     """
-    from training.experiments.run_folder import plain
     from training.experiments.study_chart import draw_chart, draw_curves
-    from training.experiments.tables import console_table, csv_of
+    from training.experiments.tables import csv_of
+    from training.experiments.timing import busy_note, describe_machine
 
+    machine = {"machine": describe_machine()} if study.timed else {}
     console, folder = call.begin(*study.checks(call.config))
     part = TrialSet(
         file=TRIALS_FILE, kind=study.trial, play=partial(_play, study.play, call.config),
         trials=study.trials(call.config), tell=partial(_told, study.trial), workers=workers, cluster=cluster,
     )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part, timed=study.timed)
-    found = [(table, lines) for table in study.tables if (lines := table.lines(rows))]
-    for table, lines in found:
-        console.print(console_table(table.title, table.headings, list(map(table.cells, lines))))
-        folder.write_text(f"{table.name}.csv", table.csv(lines))
-    tables = {table.name: [_plain(line) for line in lines] for table, lines in found}
-    call.write({"tables": tables, "trials": plain(rows)})
-    folder.write_text("trials.csv", csv_of(rows))
-    folder.write_text("tables.md", "\n".join(table.markdown(lines) for table, lines in found))
+    rows = study.unfold(run_trial_set(console, folder, part, timed=study.timed))
+    write_tables(call, study.tables, rows, study.claims and study.claims(rows), **machine)
+    if machine and (note := busy_note(machine["machine"])):
+        console.print(note, soft_wrap=True)
     if study.chart is not None:
         draw_chart(folder.path / f"{study.name}.png", study.chart, rows)
     if study.curves is not None:
         folder.write_text("curves.csv", csv_of(study.curves.lines(rows)))
         draw_curves(folder.path / "curves.png", study.curves, rows)
-    call.finish()
+    call.finish(check, [claim["holds"] for claim in call.metrics.get("claims", ())])
     if part.failures:
         raise typer.Exit(2)
+
+
+def write_tables(
+    call: Call[Any], tables: "Sequence[ResultTable]", rows: "Sequence[Row]", claims: "Sequence[Claim] | None" = None,
+    **metrics: Any,
+) -> None:  # fmt: skip
+    """Print the tables of some rows and the claims about them, and write both with the rows into the run folder."""
+    from training.experiments.run_folder import plain
+    from training.experiments.study import Column
+    from training.experiments.tables import console_table, csv_of
+
+    found = [(table, lines) for table in tables if (lines := table.lines(rows))]
+    for table, lines in found:
+        print_table(call.console, table, lines)
+        call.folder.write_text(f"{table.name}.csv", table.csv(lines))
+    if claims:
+        text = Column("", digits=2).text
+        cells = [[c.text, text(c.measured), c.limits, "holds" if c.holds else "does not hold"] for c in claims]
+        call.console.print(console_table("The paper's claims", ("claim", "measured", "limits", ""), cells))
+        metrics["claims"] = plain_lines([claim._asdict() for claim in claims])
+    by_name = {table.name: plain_lines(lines) for table, lines in found}
+    call.write({"tables": by_name, **metrics, "trials": plain(rows)})
+    call.folder.write_text("trials.csv", csv_of(rows))
+    call.folder.write_text("tables.md", "\n".join(table.markdown(lines) for table, lines in found))
+
+
+def print_table(console: Console, table: "ResultTable", lines: Sequence[dict[str, Any]]) -> None:
+    """Print a table for a narrow console: units and intervals are on a second line."""
+    from training.experiments.tables import console_table
+
+    for title, rows in table.parts(lines):
+        headings = [heading.replace(" [", "\n[") for heading in table.headings]
+        cells = [[re.sub(r" \((\S+) \.\. (\S+)\)$", r"\n\1..\2", text) for text in row] for row in rows]
+        console.print(console_table(title, headings, cells))
+    if table.note:
+        console.print(table.note)
 
 
 def _play(play: Callable[[Any, Any], Any], config: Any, trial: Any) -> dict[str, Any]:
@@ -96,13 +133,16 @@ def _told(kind: type[Any], row: dict[str, Any]) -> str:
     return ", ".join(str(row[name]) for name in kind.__dataclass_fields__ if row[name] not in ("", None))
 
 
-def _plain(line: dict[str, Any]) -> dict[str, Any]:
-    """Return a line with the value and the interval of each estimate by name."""
+def plain_lines(lines: "Sequence[Row]") -> list[dict[str, Any]]:
+    """Return lines as plain values, with the value and the interval of each estimate by name."""
+    from training.experiments.run_folder import plain
     from training.experiments.study import Estimate
 
-    plain: dict[str, Any] = {}
-    for name, value in line.items():
-        plain[name] = value.value if isinstance(value, Estimate) else value
-        if isinstance(value, Estimate) and value.low is not None:
-            plain |= {f"{name} low": value.low, f"{name} high": value.high}
-    return plain
+    found: list[dict[str, Any]] = []
+    for line in lines:
+        found.append({})
+        for name, value in line.items():
+            found[-1][name] = plain(value.value if isinstance(value, Estimate) else value)
+            if isinstance(value, Estimate) and value.low is not None:
+                found[-1] |= {f"{name} low": value.low, f"{name} high": value.high}
+    return found

@@ -90,6 +90,30 @@ def paired_difference(own: Mapping[int, float], other: Mapping[int, float]) -> F
     return np.array([own[seed] - other[seed] for seed in sorted(own.keys() & other.keys())])
 
 
+def differences(
+    rows: Sequence[Mapping[str, Any]], names: Sequence[str], by: Sequence[str], field: str, base: Any = None
+) -> list[Mapping[str, Any]]:
+    """Return the differences of some metrics to the rows with one value of a field, as rows.
+
+    Args:
+        rows: Rows, one for each seed and combination of the fields `by`.
+        names: Metrics; a difference is None if one of its values is.
+        base: Value of the field in the other row, which agrees in the seed and the other fields; None: the first value.
+
+    >>> rows = [{"policy": policy, "seed": 1, "m": m} for policy, m in (("a", 0.25), ("b", 1.0))]
+    >>> differences(rows, ["m"], ["policy"], "policy")
+    [{'policy': 'b', 'seed': 1, 'm': 0.75}]
+    """
+    first = rows[0][field] if base is None and rows else base
+    found: list[Mapping[str, Any]] = []
+    for group in grouped(rows, [*(name for name in by if name != field), "seed"]).values():
+        for other in (row for row in group if row[field] == first):
+            for row in (row for row in group if row is not other):
+                pairs = {name: (row[name], other[name]) for name in names}
+                found.append({**row} | {n: None if None in pair else pair[0] - pair[1] for n, pair in pairs.items()})
+    return found
+
+
 def format_ci(line: Mapping[str, Any], name: str, digits: int = 3, factor: float = 1.0, stacked: bool = False) -> str:
     """Format a mean with its interval, if known; unknown values give a dash.
 

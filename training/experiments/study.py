@@ -10,7 +10,7 @@
 (['method', 'error [m]', 'worst [m]'], ['icp', '0.20 (0.10 .. 0.30)', '0.30'])
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -19,8 +19,8 @@ import numpy as np
 from scipy.stats import gmean
 
 from training.experiments.config import ExperimentConfig
-from training.experiments.statistics import grouped, interval, mean_curves
-from training.experiments.tables import csv_text, in_words, number, titled_markdown
+from training.experiments.statistics import differences, grouped, interval, mean_curves
+from training.experiments.tables import csv_text, in_words, markdown_table, number
 
 Row = Mapping[str, Any]
 ConfigT = TypeVar("ConfigT", bound=ExperimentConfig)
@@ -41,6 +41,12 @@ STATISTICS: dict[str, Callable[..., Any]] = {
     "geometric mean": gmean, "p95": lambda values, axis=None: np.quantile(values, 0.95, axis=axis),
 }  # fmt: skip
 Statistic = str | Callable[[Sequence[Row]], Any]
+Words = Mapping[str, tuple[str, Callable[[Any], str]]]  # headings of fields, and texts of their values
+
+
+def value_text(words: Words, name: str, value: Any) -> str:
+    """Return the value of a field as text."""
+    return words[name][1](value) if name in words and value != ALL else str(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +107,11 @@ class ResultTable:
         columns: Further columns.
         where: Test of the rows that count.
         pooled: Fields over whose values there are further lines.
+        each: Fields with a table for each combination of their values, which its title names.
+        against: Field over whose values lines are compared, by the differences of `training.experiments.statistics`;
+            empty: there is no comparison.
+        base: Value to compare with; None: the first.
+        note: Text below the title.
         words: Headings of fields, and texts of their values.
     """
 
@@ -110,17 +121,35 @@ class ResultTable:
     columns: tuple[Column, ...]
     where: Callable[[Row], bool] = lambda row: True
     pooled: tuple[str, ...] = ()
-    words: Mapping[str, tuple[str, Callable[[Any], str]]] = field(default_factory=dict)
+    each: tuple[str, ...] = ()
+    against: str = ""
+    base: Any = None
+    note: str = ""
+    words: Words = field(default_factory=dict)
 
     @property
     def headings(self) -> list[str]:
         """Headings of all columns."""
-        fields = [self.words[name][0] if name in self.words else in_words(name)[0] for name in self.by]
+        fields = [self.words[name][0] if name in self.words else in_words(name)[0] for name in self._shown]
         return fields + [column.title for column in self.columns]
+
+    @property
+    def _shown(self) -> list[str]:
+        """Fields with a column."""
+        return [name for name in self.by if name not in self.each]
+
+    def parts(self, lines: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[list[str]]]]:
+        """Yield the title and the cells of each table."""
+        for key, group in grouped(lines, self.each).items():
+            texts = (value_text(self.words, *item) for item in zip(self.each, key, strict=True))
+            yield ", ".join((self.title, *texts)), list(map(self.cells, group))
 
     def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
         """Return a line for each group of rows in the order of first occurrence: the fields and `Estimate`s."""
         chosen = list(filter(self.where, rows))
+        if self.against:
+            names = [column.name for column in self.columns]
+            chosen = differences(chosen, names, self.by, self.against, self.base)
         groups = grouped(chosen, self.by)
         if self.pooled:
             others = [name for name in self.by if name not in self.pooled]
@@ -134,16 +163,15 @@ class ResultTable:
 
     def cells(self, line: Mapping[str, Any]) -> list[str]:
         """Return a line as text."""
-        fields = [self._text(name, line[name]) for name in self.by]
+        fields = [value_text(self.words, name, line[name]) for name in self._shown]
         return fields + [column.text(line[column.title]) for column in self.columns]
-
-    def _text(self, name: str, value: Any) -> str:
-        """Return the value of a field as text."""
-        return self.words[name][1](value) if name in self.words and value != ALL else str(value)
 
     def markdown(self, lines: Sequence[Mapping[str, Any]]) -> str:
         """Return the table as Markdown under its title."""
-        return titled_markdown(self.title, self.headings, list(map(self.cells, lines)))
+        note = f"{self.note}\n\n" if self.note else ""
+        return "\n".join(
+            f"**{title}**\n\n{note}{markdown_table(self.headings, cells)}" for title, cells in self.parts(lines)
+        )
 
     def csv(self, lines: Sequence[Mapping[str, Any]]) -> str:
         """Return the table as CSV, with all digits and the ends of intervals in columns of their own."""
@@ -207,14 +235,27 @@ class Curves:
     Attributes:
         by: Fields of the trials with a line for each combination of their values.
         columns: Names of the curves, with headings and factors; each has a panel.
+        rows: The first of these fields, with a row of panels for each combination of their values.
+        words: Headings of fields, and texts of their values.
     """
 
     by: tuple[str, ...]
     columns: tuple[Column, ...]
+    rows: tuple[str, ...] = ()
+    words: Words = field(default_factory=dict)
 
     def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
         """Return a line for each group and time: the fields, `time_s`, and means with the ends of their intervals."""
         return mean_curves(rows, self.by, [column.name for column in self.columns])
+
+
+class Claim(NamedTuple):
+    """Claim about the results, with what was measured, the limits in words, and whether it holds."""
+
+    text: str
+    measured: Estimate
+    limits: str
+    holds: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,7 +264,7 @@ class Study(Generic[ConfigT, TrialT]):
 
     Attributes:
         name: Name of its command and of its chart.
-        about: Text of `--help`; its first sentence is the summary.
+        about: Text of `--help`; its first sentence is the summary. Commands of `vslam` have their own.
         config: Class of the configuration, whose fields are options.
         trial: Frozen dataclass of a trial.
         trials: Function that returns the trials of a configuration, in order.
@@ -232,15 +273,17 @@ class Study(Generic[ConfigT, TrialT]):
         tables: Tables of the results.
         chart: Chart of the results, or none.
         curves: Curves over time, or none.
+        claims: Function that returns the claims that are checked on the rows, or none.
         checks: Function that returns the first steps of a configuration, which are run before the run folder is made,
             to detect what cannot be played.
+        unfold: Function of the rows of all trials that returns those that tables, chart and claims sum up.
         quick: Values that `--quick` sets.
         log: Default of the option `path` below the data folder, and the expected content, worded for an error.
         timed: Whether trials are timed, so that they run one after another in this process.
     """
 
     name: str
-    about: str
+    about: str = ""
     config: type[ConfigT]
     trial: type[TrialT]
     trials: Callable[[ConfigT], Sequence[TrialT]]
@@ -248,7 +291,9 @@ class Study(Generic[ConfigT, TrialT]):
     tables: tuple[ResultTable, ...]
     chart: Chart | None = None
     curves: Curves | None = None
+    claims: Callable[[Sequence[Row]], Sequence[Claim]] | None = None
     checks: Callable[[ConfigT], Iterable[Callable[[], object]]] = lambda config: ()
+    unfold: Callable[[Sequence[Row]], Sequence[Row]] = lambda rows: rows
     quick: Mapping[str, Any] = field(default_factory=dict)
     log: tuple[Path, str] | None = None
     timed: bool = False

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -10,39 +12,50 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodF
 
 from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.statistics import grouped
-from training.experiments.study import Chart, Column, Curves, Panel, Row
+from training.experiments.study import Chart, Column, Curves, Panel, Row, value_text
 from training.experiments.tables import in_words
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for the colour-blind
 MARKERS = "osD^vxP"
+WIDTH = 45  # of a title [letters]
 STYLES = "-", "--", ":", "-."
 
 
 @picture
 def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
-    """Draw the chart of a study into a PNG file; nothing if no row counts."""
+    """Draw the chart of a study into a PNG file; nothing if no row counts. Panels without values leave no gaps."""
     chosen = list(filter(chart.where, rows))
-    facets = grouped(chosen, (chart.rows,) if chart.rows else ())
-    if not facets:
+    drawn = [
+        (key, group, panel)
+        for key, group in grouped(chosen, (chart.rows,) if chart.rows else ()).items()
+        for panel in chart.panels
+        if panel.column.estimate(group).value is not None
+    ]
+    if not drawn:
         return
     names = [name for (name,) in grouped(chosen, (chart.by,))] if chart.by else [""]
+    columns = min(len(chart.panels), len(drawn))
+    count = -(-len(drawn) // columns)
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
-        size = 3.1 * len(chart.panels), 2.7 * len(facets) + 0.4
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(len(facets), len(chart.panels), squeeze=False, sharex=True)
-        for row, (key, group) in zip(axes, facets.items(), strict=True):
-            for ax, panel in zip(row, chart.panels, strict=True):
-                _draw_panel(ax, chart, panel, group, names)
-            if key:
-                row[0].set_title(chart.title(key[0]), loc="left")
-        for ax in axes[-1]:
-            ax.set_xlabel(chart.label)
+        figure = Figure(figsize=(3.1 * columns, 2.7 * count + 0.4), layout="constrained")
+        axes = figure.subplots(count, columns, squeeze=False, sharex=True).ravel()
+        last = None
+        for place, (ax, (key, group, panel)) in enumerate(zip(axes, drawn, strict=False)):
+            draw_panel(ax, chart, panel, group, names)
+            if key and (key != last or place % columns == 0):
+                ax.set_title(fill(chart.title(key[0]), WIDTH), loc="left")
+            last = key
+            if place + columns >= len(drawn):
+                ax.set_xlabel(chart.label)
+                ax.tick_params(labelbottom=True)
+        for ax in axes[len(drawn) :]:
+            ax.set_visible(False)
         if chart.by:
-            add_legend(figure, axes[0][0], title=in_words(chart.by)[0])
+            add_legend(figure, axes[0], title=in_words(chart.by)[0])
         save_png(figure, file, 110)
 
 
-def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
+def draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
     """Draw a quantity over the field of the x axis, a line for each of some names; a level one where there is no x."""
     column = panel.column
     factor = _factor(column)
@@ -90,22 +103,43 @@ def draw_curves(file: Path, curves: Curves, rows: Sequence[Row]) -> None:
     lines = curves.lines(rows)
     if not lines:
         return
-    with mpl.rc_context({"font.size": 9}):
-        figure = Figure(figsize=(3.1 * len(curves.columns), 3.1), layout="constrained")
-        axes = figure.subplots(1, len(curves.columns), squeeze=False)[0]
-        for ax, column in zip(axes, curves.columns, strict=True):
-            for place, (key, group) in enumerate(grouped(lines, curves.by).items()):
-                known = [line for line in group if line[column.name] is not None]
-                ax.plot(
-                    [line["time_s"] for line in known], [_factor(column) * line[column.name] for line in known], lw=1.2,
-                    color=COLOURS[place % len(COLOURS)], ls=STYLES[place // len(COLOURS) % len(STYLES)],
-                    label=", ".join(map(str, key)),
-                )  # fmt: skip
+    facets = grouped(lines, curves.rows)
+    keys = list(grouped(lines, curves.by[len(curves.rows) :]))
+    with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
+        size = 3.1 * len(curves.columns), 2.7 * len(facets) + 0.4
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(len(facets), len(curves.columns), squeeze=False, sharex=True)
+        for panels, (place, facet) in zip(axes, facets.items(), strict=True):
+            for ax, column in zip(panels, curves.columns, strict=True):
+                for key, group in grouped(facet, curves.by[len(curves.rows) :]).items():
+                    _draw_curve(ax, curves, column, key, keys.index(key), group)
+                ax.set_ylabel(column.title)
+                ax.grid(alpha=0.2)
+            panels[0].set_title(_label(curves, curves.rows, place), loc="left")
+        for ax in axes[-1]:
             ax.set_xlabel("time [s]")
-            ax.set_ylabel(column.title)
-            ax.grid(alpha=0.2)
-        add_legend(figure, axes[0], title=", ".join(in_words(name)[0] for name in curves.by))
+        title = ", ".join(in_words(name)[0] for name in curves.by[len(curves.rows) :])
+        add_legend(figure, axes[0][0], title=title)
         save_png(figure, file, 110)
+
+
+def _draw_curve(ax: Axes, curves: Curves, column: Column, key: Any, place: int, group: Sequence[Row]) -> None:
+    """Draw the mean of a group over time with its interval."""
+    known = [line for line in group if line[column.name] is not None]
+    times, style = [line["time_s"] for line in known], STYLES[place // len(COLOURS) % len(STYLES)]
+    colour, factor = COLOURS[place % len(COLOURS)], _factor(column)
+    ax.plot(
+        times, [factor * line[column.name] for line in known], lw=1.2, color=colour, ls=style,
+        label=_label(curves, curves.by[len(curves.rows) :], key),
+    )  # fmt: skip
+    if known and known[0][f"{column.name}_low"] is not None:
+        low, high = ([factor * line[f"{column.name}_{end}"] for line in known] for end in ("low", "high"))
+        ax.fill_between(times, low, high, color=colour, alpha=0.12, lw=0)
+
+
+def _label(curves: Curves, names: Sequence[str], values: Sequence[Any]) -> str:
+    """Return values of fields as text."""
+    return ", ".join(value_text(curves.words, *item) for item in zip(names, values, strict=True))
 
 
 def _factor(column: Column) -> float:

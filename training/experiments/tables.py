@@ -122,11 +122,6 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
     return "".join("| " + " | ".join(row) + " |\n" for row in (headings, rule, *rows))
 
 
-def titled_markdown(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table under a bold title, or nothing if it has no rows."""
-    return f"**{title}**\n\n{markdown_table(headings, rows)}" if rows else ""
-
-
 def csv_text(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     r"""Return rows as CSV with a header: floats have six significant digits, None is empty.
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from slam_backend.core.validation import FloatArray
 
@@ -63,23 +62,6 @@ def clock(call: Callable[[Any], Any], arguments: Sequence[Any]) -> FloatArray:
     return durations / 1e9
 
 
-def run_named_trials(
-    trials: Sequence[tuple[str, Callable[[], object]]],
-    on_trial: Callable[[str], None],
-    should_stop: Callable[[], bool],
-) -> bool:
-    """Run named trials until all are done or the user stops; return whether all are done.
-
-    `on_trial` is called with the name of each trial before it starts, and `should_stop` before that.
-    """
-    for name, trial in trials:
-        if should_stop():
-            return False
-        on_trial(name)
-        trial()
-    return True
-
-
 def describe_machine() -> dict[str, Any]:
     """Return the processor, its number of cores, and the one-minute load."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
@@ -96,10 +78,7 @@ def processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def print_caveats(console: Console, result: Mapping[str, Any]) -> None:
-    """Print a warning if the machine was busy or the user stopped the benchmark."""
-    load = result["machine"]["load_before"]
-    if load is not None and load > BUSY:
-        console.print(f"The machine was busy (load {load:.1f}): times may be too long.")
-    if not result["complete"]:
-        console.print("Stopped early: the tables contain only the trials up to then.")
+def busy_note(machine: Mapping[str, Any]) -> str:
+    """Return a warning if the machine was busy, else nothing."""
+    load = machine["load_before"]
+    return "" if load is None or load <= BUSY else f"The machine was busy (load {load:.1f}): times may be too long."

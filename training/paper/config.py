@@ -1,13 +1,13 @@
 """Configurations of the paper's figures."""
 
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from training.experiments.config import ONE_PARTICLE, ExperimentConfig, Positive, first_seed, option
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
-    from training.paper.fig2 import Fig2Trial
-    from training.paper.fig6.trials import ErrorTrial, TimeTrial
+    from training.paper.fig6.trials import Trial
 
 STEP = 0.25  # distance between frames along the path [m]
 SEEN = "Use at least one landmark."
@@ -32,6 +32,17 @@ class Fig1Config(ExperimentConfig):
         check_crossings(self.robots)
 
 
+@dataclass(frozen=True, slots=True)
+class Fig2Trial:
+    """One run of two robots; fields as in `Fig2Config`."""
+
+    length: float
+    every: float
+    landmarks: int
+    particles: int
+    seed: int
+
+
 class Fig2Config(ExperimentConfig):
     """Fig. 2: errors of alignment methods over the size of two robots' maps."""
 
@@ -50,10 +61,8 @@ class Fig2Config(ExperimentConfig):
 
         check_float("length", self.length, "Give metres, at least one stage.", at_least=self.every)
 
-    def trials(self) -> list["Fig2Trial"]:
+    def trials(self) -> list[Fig2Trial]:
         """Return one trial for each seed."""
-        from training.paper.fig2 import Fig2Trial
-
         return [
             Fig2Trial(self.length, self.every, self.landmarks, self.particles, seed)
             for seed in range(self.seed, self.seed + self.seeds)
@@ -104,28 +113,23 @@ class Fig6Config(ExperimentConfig):
         """Refuse combinations without a valid trial."""
         from training.stereo_runs.office import check_crossings
 
-        self.error_trials()
-        self.time_trials()
+        self.trials()
         check_crossings(max(self.robots))
 
-    def error_trials(self) -> list["ErrorTrial"]:
-        """Return the trials of the map error, ordered by seed, with the trials of one run in succession."""
-        from training.paper.fig6.trials import BOUND, FEW, REGIMES, ErrorTrial
+    def trials(self) -> list["Trial"]:
+        """Return the trials: errors by seed, those of one run in succession, then times in the paper's regime."""
+        from training.paper.fig6.trials import BOUND, FEW, REGIMES, Trial
 
-        return [
-            ErrorTrial(name, proposal, robots, particles, self.measurements, self.length, seed)
-            for seed, name, robots in product(range(self.seed, self.seed + self.seeds), self.regimes, self.robots)
+        shared: dict[str, Any] = {"measurements": self.measurements, "length": self.length}
+        seeds = range(self.seed, self.seed + self.seeds)
+        errors = [
+            Trial(regime=name, proposal=proposal, robots=(robots,), particles=particles, seed=seed, **shared)
+            for seed, name, robots in product(seeds, self.regimes, self.robots)
             for proposal in REGIMES[name].proposals
             for particles in ((0,) if proposal == BOUND else self.particles)
             if particles in FEW or proposal == BOUND or not REGIMES[name].few
         ]
-
-    def time_trials(self) -> list["TimeTrial"]:
-        """Return the trials of the step time, ordered by seed; none without the paper's regime."""
-        from training.paper.fig6.trials import TimeTrial
-
-        seeds = range(self.seed, self.seed + self.seeds) if "paper" in self.regimes else ()
-        return [
-            TimeTrial(self.robots, particles, self.measurements, self.length, seed)
-            for seed, particles in product(seeds, self.particles)
+        return errors + [
+            Trial(robots=self.robots, particles=particles, seed=seed, is_timed=True, **shared)
+            for seed, particles in product(seeds if "paper" in self.regimes else (), self.particles)
         ]

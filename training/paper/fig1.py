@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.patches import Rectangle
 
 from slam_backend.core.validation import FloatArray, IntArray
 from training.experiments.plotting import picture, rgb, save_png
+from training.experiments.study import Column, ResultTable
 from training.paper.config import Fig1Config
 from training.paper.fig6.trials import FILTER_OPTIONS, REGIMES
 from training.stereo_runs.batch_problem import BatchProblem
@@ -75,22 +77,34 @@ def draw_clouds(run: StereoRun, config: Fig1Config, measured: bool) -> Clouds:
     )  # fmt: skip
 
 
-def path_errors(run: StereoRun, clouds: Clouds) -> list[dict[str, float]]:
+def path_errors(run: StereoRun, clouds: Clouds, name: str) -> list[dict[str, Any]]:
     """Return the errors of path and last particles for each robot.
 
+    Args:
+        name: Name of the dashed path.
+
     Returns:
-        `path_rms_m` of the dashed path, `end_error_m` at the last set of particles, and `end_spread_m` of that set.
+        Rows of `path`, the name; `robot`; `path_rms_m` of the dashed path, `end_error_m` at the last set of particles,
+        and `end_spread_m` of that set.
     """
     errors = np.linalg.norm((clouds.paths - run.true_paths)[..., :2], axis=2)
     spreads = clouds.spreads()[-1]
     return [
         {
-            "path_rms_m": float(np.sqrt((own**2).mean())),
-            "end_error_m": float(own[clouds.steps[-1]]),
-            "end_spread_m": float(spread),
+            "path": name, "robot": robot, "path_rms_m": float(np.sqrt((own**2).mean())),
+            "end_error_m": float(own[clouds.steps[-1]]), "end_spread_m": float(spread),
         }
-        for own, spread in zip(errors, spreads, strict=True)
-    ]
+        for robot, (own, spread) in enumerate(zip(errors, spreads, strict=True), 1)
+    ]  # fmt: skip
+
+
+TABLE = ResultTable(
+    name="paths", title="Errors of paths and of the last particles", by=("path", "robot"),
+    columns=(
+        Column("path_rms_m", "path RMS [m]", digits=2), Column("end_error_m", "final error [m]", digits=2),
+        Column("end_spread_m", "final spread [m]", digits=2),
+    ),
+)  # fmt: skip
 
 
 @picture

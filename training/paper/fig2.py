@@ -1,22 +1,18 @@
 """Fig. 2 of the paper: errors of alignment methods over the size of the two maps."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, align_maps, propose_motion
-from training.experiments.plotting import add_legend, picture, save_png
-from training.experiments.tables import csv_text
+from training.experiments.study import Chart, Claim, Column, Estimate, Panel, ResultTable, Row, Study
+from training.paper.config import Fig2Config, Fig2Trial
 from training.paper.map_pairs import map_alone, simulate_pair, true_motion
 
-TRIALS_FILE = "runs.jsonl"
 PAPER_METHODS = ("svd", "icp", "impicp", "ransac")
 OURS = "ours"  # ransac with refinement and refusals
 METHODS = (*PAPER_METHODS, OURS)
@@ -24,29 +20,14 @@ ENOUGH_SHARED = 12  # shared landmarks below which maps need not be alignable
 BIN = 50  # width of a bin [landmarks]
 # Thresholds of "practically zero", for medians over the runs in each bin.
 PRACTICALLY_ZERO = {"translation_m": 0.2, "rotation_deg": 1.0}
-LABELS = {"translation_m": "translation [m]", "rotation_deg": "rotation [°]"}
-
-COLOURS = {"svd": "#7f7f7f", "icp": "#D55E00", "impicp": "#E69F00", "ransac": "#0072B2", OURS: "#009E73"}
-MARKERS = {"svd": "x", "icp": "v", "impicp": "D", "ransac": "o", OURS: "s"}
-NAMES = {"svd": "SVD", "icp": "ICP", "impicp": "ImpICP", "ransac": "RANSAC", OURS: "ours, refined, where accepted"}
+FALSE = {"translation_m": DISTINCT_TRANSLATION, "rotation_deg": float(np.rad2deg(DISTINCT_ROTATION))}
 
 
-@dataclass(frozen=True, slots=True)
-class Fig2Trial:
-    """One run of two robots; fields as in `Fig2Config`."""
-
-    length: float
-    every: float
-    landmarks: int
-    particles: int
-    seed: int
-
-
-def play(trial: Fig2Trial) -> dict[str, Any]:
+def play(config: Fig2Config, trial: Fig2Trial) -> dict[str, Any]:
     """Let two robots map, and align their maps at each stage of the path.
 
     Returns:
-        Fields of the trial and `stages`: rows of `length`, `size` (mean number of landmarks of the two maps), `shared`
+        `stages`: rows of `length`, `size` (mean number of landmarks of the two maps), `shared`
         true landmarks, and `translation_m` and `rotation_deg` of each method, None where it gives no alignment.
     """
     run = simulate_pair(trial.seed, trial.length, trial.landmarks)
@@ -61,7 +42,7 @@ def play(trial: Fig2Trial) -> dict[str, Any]:
         found = align_maps(*stage.maps, rng=np.random.default_rng(trial.seed))
         row[OURS] = _error(found.transform, truth) if found.success else None
         stages.append(row)
-    return asdict(trial) | {"stages": stages}
+    return {"stages": stages}
 
 
 def _error(motion: FloatArray | None, truth: FloatArray) -> dict[str, float] | None:
@@ -72,105 +53,93 @@ def _error(motion: FloatArray | None, truth: FloatArray) -> dict[str, float] | N
     return {"translation_m": float(np.hypot(*(motion - truth)[:2])), "rotation_deg": turned}
 
 
-def summarise(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return one line for each bin of map sizes and each method, over the stages with enough shared landmarks.
-
-    Returns:
-        Lines of `size` (middle of the bin), `method`, `stages`, `found` (share of stages with a result), and `_median`,
-        `_mean` and `_p90` of `translation_m` and `rotation_deg` over these; None without a result.
-    """
-    bins: dict[int, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        for stage in row["stages"]:
-            if stage["shared"] >= ENOUGH_SHARED:
-                bins.setdefault(int(stage["size"] // BIN), []).append(stage)
-    lines = []
-    for place, stages in sorted(bins.items()):
-        for method in METHODS:
-            found = [stage[method] for stage in stages if stage[method] is not None]
-            line: dict[str, Any] = {
-                "size": (place + 0.5) * BIN, "method": method, "stages": len(stages), "found": len(found) / len(stages),
-            }  # fmt: skip
-            for name in PRACTICALLY_ZERO:
-                values = np.array([error[name] for error in found])
-                figures = (np.median(values), values.mean(), np.quantile(values, 0.9)) if found else (None,) * 3
-                line |= dict(zip((f"{name}_{kind}" for kind in ("median", "mean", "p90")), figures, strict=True))
-            lines.append(line)
-    return lines
-
-
-def refusals(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Return the number of stages with too few shared landmarks, and of false alignments of ours among them."""
-    poor = [stage for row in rows for stage in row["stages"] if stage["shared"] < ENOUGH_SHARED]
-    false = [
-        stage for row in rows for stage in row["stages"]
-        if stage[OURS] is not None
-        and (
-            stage[OURS]["translation_m"] > DISTINCT_TRANSLATION
-            or stage[OURS]["rotation_deg"] > np.rad2deg(DISTINCT_ROTATION)
-        )
+def unfold(rows: Sequence[Row]) -> list[Row]:
+    """Return a row for each stage and method: errors, None without an alignment, and `size`, the middle of a bin."""
+    return [
+        {
+            "seed": row["seed"], "length_m": stage["length"], "landmarks": stage["size"],
+            "size": (stage["size"] // BIN + 0.5) * BIN, "shared": stage["shared"], "method": method,
+            "found": stage[method] is not None, **(stage[method] or dict.fromkeys(PRACTICALLY_ZERO)),
+        }
+        for row in rows
+        for stage in row["stages"]
+        for method in METHODS
     ]  # fmt: skip
-    return {"share_too_little": len(poor), "false": len(false)}
 
 
-def check_claims(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _spread(name: str, rows: Sequence[Row]) -> Estimate:
+    """Return the median of an error, from which its interval reaches to the 90 % quantile."""
+    values = [row[name] for row in rows if row[name] is not None]
+    return Estimate(*map(float, np.quantile(values, (0.5, 0.5, 0.9)))) if values else Estimate(None)
+
+
+def _share_enough(row: Row) -> bool:
+    return bool(row["shared"] >= ENOUGH_SHARED)
+
+
+def _poor(rows: Sequence[Row]) -> int:
+    """Return the number of stages with too few shared landmarks."""
+    return sum(not _share_enough(row) for row in rows)
+
+
+def _false(rows: Sequence[Row]) -> int:
+    """Return the number of false alignments."""
+    return sum(row["found"] and any(row[name] > limit for name, limit in FALSE.items()) for row in rows)
+
+
+def check_claims(rows: Sequence[Row]) -> list[Claim]:
     """Check the paper's claim: RANSAC is best, with practically zero error for any size of the maps.
 
-    Returns:
-        Rows of `claim`, `measured`, `at_most` and `holds`; means weigh all sizes equally.
+    Means weigh all sizes equally; an error is infinite where a method gives no alignment.
     """
-    claims: list[dict[str, Any]] = []
-    sizes = sorted({line["size"] for line in lines})
-    at = {(line["size"], line["method"]): line for line in lines}
+    at = {(line["size"], line["method"]): line for line in TABLE.lines(rows)}
+    sizes = {size for size, _ in at}
 
-    def figure(size: float, method: str, name: str) -> float:
-        value = at[size, method][name]
-        return float("inf") if value is None else float(value)
+    def errors(method: str, column: Column) -> list[float]:
+        found = [at[size, method][column.title].value for size in sizes]
+        return [float("inf") if value is None else value for value in found]
 
-    for name, limit in PRACTICALLY_ZERO.items():
-        worst = max((figure(size, "ransac", f"{name}_median") for size in sizes), default=float("inf"))
-        claims.append({"claim": f"RANSAC, median {LABELS[name]}, worst size", "measured": worst, "at_most": limit})
+    claims = []
+    for limit, median, mean in zip(PRACTICALLY_ZERO.values(), MEDIANS, MEANS, strict=True):
+        found = {f"RANSAC, median {median.title}, worst size": (max(errors("ransac", median), default=np.inf), limit)}
         for other in ("svd", "icp", "impicp"):
-            ours, theirs = (sum(figure(size, m, f"{name}_mean") for size in sizes) for m in ("ransac", other))
-            ratio = ours / theirs if sizes else float("inf")
-            claims.append({"claim": f"RANSAC over {other}, mean {LABELS[name]}", "measured": ratio, "at_most": 1.0})
-    return [claim | {"holds": bool(claim["measured"] <= claim["at_most"])} for claim in claims]
+            ratio = sum(errors("ransac", mean)) / sum(errors(other, mean)) if sizes else np.inf
+            found[f"RANSAC over {other}, {mean.title}"] = ratio, 1.0
+        for text, (value, most) in found.items():
+            claims.append(Claim(text, Estimate(value), f"at most {most:g}", bool(value <= most)))
+    return claims
 
 
-def to_csv(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return every stage and method as CSV."""
-    headings = ["seed", "length_m", "size", "shared", "method", *PRACTICALLY_ZERO]
-    lines = []
-    for row in rows:
-        for stage in row["stages"]:
-            for method in METHODS:
-                error = stage[method] or dict.fromkeys(PRACTICALLY_ZERO)
-                lines.append([row["seed"], stage["length"], stage["size"], stage["shared"], method, *error.values()])
-    return csv_text(headings, lines)
+MEDIANS = tuple(Column(name, statistic=partial(_spread, name)) for name in PRACTICALLY_ZERO)
+MEANS = tuple(Column(name, f"mean {Column(name).title}") for name in PRACTICALLY_ZERO)
+TABLE = ResultTable(
+    name="fig2",
+    title="Errors over the size of the maps: medians (to 90 %)",
+    by=("size", "method"),
+    where=_share_enough,
+    columns=(Column("found", "found [%]", digits=0, factor=100.0), *MEDIANS, *MEANS),
+)
 
-
-@picture
-def draw_fig2(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
-    """Draw medians as lines and 90 % quantiles as error bars, on a log scale, into a PNG file."""
-    with mpl.rc_context({"font.size": 9}):
-        figure = Figure(figsize=(10.0, 4.0), layout="constrained")
-        panels = figure.subplots(1, 2)
-        for letter, axes, (name, label) in zip("ab", panels, LABELS.items(), strict=True):
-            for place, method in enumerate(METHODS):
-                chosen = [line for line in lines if line["method"] == method and line[f"{name}_median"] is not None]
-                if not chosen:
-                    continue
-                middle = [line[f"{name}_median"] for line in chosen]
-                above = [max(line[f"{name}_p90"] - line[f"{name}_median"], 0.0) for line in chosen]
-                axes.errorbar(
-                    [line["size"] + 3.0 * (place - 2) for line in chosen], middle, yerr=[[0.0] * len(chosen), above],
-                    marker=MARKERS[method], ms=4.5, mfc="none", lw=1.2, elinewidth=0.7, capsize=2,
-                    color=COLOURS[method], label=NAMES[method],
-                )  # fmt: skip
-            axes.set_yscale("log")
-            axes.set_xlabel("landmarks in a map")
-            axes.set_ylabel(f"error in {label}")
-            axes.set_title(f"({letter})", loc="left")
-            axes.grid(alpha=0.2, which="both")
-        add_legend(figure, panels[0])
-        save_png(figure, file, 120)
+STUDY = Study(
+    name="fig2",
+    config=Fig2Config,
+    trial=Fig2Trial,
+    trials=Fig2Config.trials,
+    play=play,
+    unfold=unfold,
+    claims=check_claims,
+    tables=(
+        TABLE,
+        ResultTable(
+            name="refusals", title="All stages", by=("method",),
+            columns=(
+                Column("poor", "share too little", _poor, digits=0),
+                Column("false", "falsely aligned", _false, digits=0),
+            ),
+        ),
+    ),
+    chart=Chart(
+        x="size", label="landmarks in a map", by="method", where=_share_enough,
+        panels=tuple(Panel(column=column, log=True) for column in MEDIANS),
+    ),
+)  # fmt: skip

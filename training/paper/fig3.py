@@ -17,7 +17,7 @@ from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.fusion import fuse_maps, move_covariances
 from slam_backend.maps.landmark_map import LandmarkMap
 from training.experiments.plotting import CHI_SQUARE_95, ellipse_95, picture, save_png
-from training.experiments.tables import csv_text
+from training.experiments.study import Column, ResultTable
 from training.paper.config import PairConfig
 from training.paper.map_pairs import Stage, map_alone, simulate_pair, true_motion
 
@@ -41,19 +41,10 @@ class AlignedPair:
         """Both maps, in their start frames."""
         return self.stage.maps
 
-    def figures(self) -> dict[str, Any]:
-        """Return the number of matches, the number of true ones among them, and the errors of the transform."""
-        ids_a, ids_b = (ids[rows] for ids, rows in zip(self.stage.true_ids, self.alignment.inliers.T, strict=True))
+    def errors(self) -> tuple[float, float]:
+        """Return the errors of the transform [m, degrees]."""
         error = self.alignment.transform - self.truth
-        return {
-            "landmarks": [len(own) for own in self.maps], "shared": self.stage.shared,
-            "candidates": len(self.candidates), "inliers": len(self.alignment.inliers),
-            "true_inliers": int(np.count_nonzero((ids_a == ids_b) & (ids_a >= 0))),
-            "transform": self.alignment.transform.tolist(),
-            "sigmas": np.sqrt(np.diag(self.alignment.covariance)).tolist(),
-            "translation_error_m": float(np.hypot(error[0], error[1])),
-            "rotation_error_deg": abs(float(np.rad2deg(wrap_angle(error[2])))),
-        }  # fmt: skip
+        return float(np.hypot(error[0], error[1])), abs(float(np.rad2deg(wrap_angle(error[2]))))
 
 
 def align_pair(config: PairConfig) -> AlignedPair:
@@ -98,27 +89,47 @@ def fuse_pair(pair: AlignedPair, shown: int = SHOWN) -> FusedLandmarks:
     )  # fmt: skip
 
 
-def matches_csv(pair: AlignedPair) -> str:
-    """Return every inlier as CSV: its position in both maps, and the aligned position of the second."""
-    headings = ["true_a", "true_b", "ax", "ay", "az", "bx", "by", "bz", "moved_x", "moved_y"]
+def matches(pair: AlignedPair) -> list[dict[str, Any]]:
+    """Return a row for each match: true landmarks, positions in both maps, the aligned second one, and `is_true`."""
     map_a, map_b = pair.maps
     rows = []
     for a, b in pair.alignment.inliers.tolist():
+        true_a, true_b = int(pair.stage.true_ids[0][a]), int(pair.stage.true_ids[1][b])
         moved = transform_points(pair.alignment.transform, map_b.means[b])
-        true_ids = int(pair.stage.true_ids[0][a]), int(pair.stage.true_ids[1][b])
-        rows.append([*true_ids, *(f"{v:.4f}" for v in (*map_a.means[a], *map_b.means[b], *moved[:2]))])
-    return csv_text(headings, rows)
+        names = ("ax", "ay", "az", "bx", "by", "bz", "moved_x", "moved_y")
+        points = map(float, (*map_a.means[a], *map_b.means[b], *moved[:2]))
+        rows.append(
+            {"true_a": true_a, "true_b": true_b, **dict(zip(names, points, strict=True))}
+            | {"is_true": true_a == true_b and true_a >= 0}
+        )
+    return rows
 
 
-def ellipses_csv(fused: FusedLandmarks) -> str:
-    """Return means and covariances before and after fusion as CSV."""
-    headings = ["landmark", "which", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz"]
-    upper = np.triu_indices(3)
+def ellipses(fused: FusedLandmarks) -> list[dict[str, Any]]:
+    """Return a row for each landmark and map: mean, covariance, and root of the determinant in the plane [cm^2]."""
+    names = ("x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
     rows = []
     for i, true_id in enumerate(fused.true_ids.tolist()):
-        for kind, means, covariances in zip(("map 1", "map 2", "fused"), fused.means, fused.covariances, strict=True):
-            rows.append([true_id, kind, *(f"{v:.3e}" for v in (*means[i], *covariances[i][upper]))])
-    return csv_text(headings, rows)
+        for kind, means, covariances in zip(COLOURS, fused.means, fused.covariances, strict=True):
+            values = map(float, (*means[i], *covariances[i][np.triu_indices(3)]))
+            area = float(1e4 * np.sqrt(np.linalg.det(covariances[i][:2, :2])))
+            rows.append({"landmark": true_id, "map": kind, **dict(zip(names, values, strict=True)), "area_cm2": area})
+    return rows
+
+
+MATCHES = ResultTable(
+    name="matches", title="Matches", by=("seed",),
+    columns=(
+        Column("matches", statistic=len, digits=0), Column("is_true", "true", "sum", digits=0),
+        Column("translation_m", "error [m]"), Column("rotation_deg", "error [deg]", digits=2),
+    ),
+)  # fmt: skip
+ELLIPSES = ResultTable(
+    name="ellipses",
+    title="Ellipses before and after fusion",
+    by=("landmark", "map"),
+    columns=(Column("area_cm2", "area / pi [cm^2]", digits=2),),
+)
 
 
 @picture
@@ -143,12 +154,9 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
         )
         _dots(right, map_a.means[:, :2], "map 1")
         _dots(right, moved[:, :2], "map 2")
-        figures = pair.figures()
-        right.set_title(
-            f"(b) map 2 moved into the frame of map 1,\nerror {100 * figures['translation_error_m']:.0f} cm and "
-            f"{figures['rotation_error_deg']:.1f}°",
-            loc="left",
-        )
+        metres, degrees = pair.errors()
+        title = f"(b) map 2 moved into the frame of map 1,\nerror {100 * metres:.0f} cm and {degrees:.1f}°"
+        right.set_title(title, loc="left")
         for axes in (left, right):
             axes.set_aspect("equal")
             axes.set_xlabel("x [m]")

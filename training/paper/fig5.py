@@ -1,7 +1,10 @@
 """Fig. 5 of the paper: three robots in a room, the landmarks that they see, and those hidden by walls."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -12,7 +15,7 @@ from matplotlib.patches import Wedge
 from agents.registry import make_policy
 from slam_backend.core.validation import BoolArray, FloatArray
 from training.experiments.plotting import picture, save_png
-from training.experiments.tables import csv_text
+from training.experiments.study import Column, ResultTable, Row
 from training.paper.config import Fig5Config
 from vslam_env import EnvConfig, vslam_v1
 from vslam_env.environment import ExplorationEnv
@@ -21,6 +24,7 @@ from vslam_env.sensors import LandmarkSensor
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
 STATES = ("hidden", "seen", "measured")
+MARK = ("landmark_x", "landmark_y", "landmark_z")
 
 WIDTH = 7.0  # [in]
 BODY = 0.35  # radius of drawn robots [m], larger than the true one
@@ -43,26 +47,31 @@ class Fig5:
     seen: BoolArray  # (K, N) bool. Visible landmarks.
     measured: BoolArray  # (K, N) bool. Landmarks measured in this tick.
 
-    def figures(self) -> list[dict[str, int]]:
-        """Return the numbers of landmarks in view, hidden, seen and measured of each robot."""
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for each robot and landmark in its view: positions, and whether it is seen and measured."""
         return [
             {
-                "in_view": int(view.sum()), "hidden": int((view & ~seen).sum()), "seen": int(seen.sum()),
-                "measured": int(used.sum()),
+                "robot": robot, **dict(zip(("x", "y", "theta"), map(float, pose), strict=True)), "landmark": int(mark),
+                **dict(zip(MARK, map(float, self.landmarks[mark]), strict=True)),
+                "state": STATES[int(self.seen[robot, mark]) + int(self.measured[robot, mark])],
             }
-            for view, seen, used in zip(self.in_view, self.seen, self.measured, strict=True)
+            for robot, pose in enumerate(self.poses)
+            for mark in np.flatnonzero(self.in_view[robot])
         ]  # fmt: skip
 
-    def to_csv(self) -> str:
-        """Return a CSV row for each robot and landmark in its view: positions, and whether it is seen and measured."""
-        headings = ["robot", "x", "y", "theta", "landmark", "landmark_x", "landmark_y", "landmark_z", "state"]
-        rows = []
-        for robot, pose in enumerate(self.poses):
-            for mark in np.flatnonzero(self.in_view[robot]):
-                state = STATES[int(self.seen[robot, mark]) + int(self.measured[robot, mark])]
-                numbers = [f"{value:.4f}" for value in (*pose, *self.landmarks[mark])]
-                rows.append([robot, *numbers[:3], int(mark), *numbers[3:], state])
-        return csv_text(headings, rows)
+
+def _count(states: Sequence[str], rows: Sequence[Row]) -> int:
+    return sum(row["state"] in states for row in rows)
+
+
+TABLE = ResultTable(
+    name="robots", title="Landmarks in view", by=("robot",), pooled=("robot",),
+    columns=(
+        Column("in_view", statistic=len, digits=0), Column("hidden", "", partial(_count, STATES[:1]), digits=0),
+        Column("seen", "", partial(_count, STATES[1:]), digits=0),
+        Column("measured", "", partial(_count, STATES[2:]), digits=0),
+    ),
+)  # fmt: skip
 
 
 def simulate_fig5(config: Fig5Config) -> Fig5:

@@ -1,4 +1,4 @@
-"""`vslam bench env`: rows, budget of a step, and missing packages."""
+"""`vslam bench speed env`: rows, budget of a step, and missing packages."""
 
 import json
 from pathlib import Path
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from training.bench.config import EnvBenchConfig
-from training.bench.env import profile as env_budget
-from training.bench.env import timing as env_timing
-from training.bench.env.bench import run_bench
-from training.bench.env.timing import (
+from training.bench.speed import plays as env_timing
+from training.bench.speed import profile as env_budget
+from training.bench.speed.config import EnvSpeedConfig
+from training.bench.speed.env import OTHER, PART, STEP, STUDY, trials
+from training.bench.speed.plays import (
     BURST,
     Play,
     play_alternating,
@@ -53,7 +53,7 @@ def test_nested_phases_are_not_counted_twice(monkeypatch: pytest.MonkeyPatch) ->
         _Nested.now += 1000
         _Nested().outer()
 
-    rows = {row["phase"]: row for row in env_budget.measure_budget(step, [None] * 3)}
+    rows = env_budget.measure_budget(step, [None] * 3)
     assert list(rows) == ["outer", "inner", env_budget.REST]
     assert [row["median_us"] for row in rows.values()] == [2.0, 4.0, 1.0]
     assert [row["mean_us"] for row in rows.values()] == [2.0, 4.0, 1.0]
@@ -67,7 +67,7 @@ def test_a_step_calls_all_phases() -> None:
     env.reset(seed=3)
     actions = [{agent: np.array([0.3, 0.5]) for agent in env.agents}] * 25
     rows = env_budget.measure_budget(env.step, actions)
-    assert all(row["mean_us"] > 0.0 for row in rows)
+    assert all(row["mean_us"] > 0.0 for row in rows.values())
     assert [owner.__dict__[name] for phase in env_budget.PHASES for owner, name in phase.calls] == before
 
 
@@ -122,48 +122,48 @@ def test_ratios_do_not_depend_on_machine_speed() -> None:
 
 
 def test_each_load_changes_one_number_of_the_base() -> None:
-    """The first numbers are the base; every other row changes one of them."""
-    loads = EnvBenchConfig(robots=(2, 1), particles=(10, 20), worlds=("fig5", "hall"), modes=("driver", "goal")).loads()
-    assert len(loads) == 5
-    base = loads[0]
-    for load in loads[1:]:
-        assert sum(getattr(load, name) != getattr(base, name) for name in ("robots", "particles", "world", "mode")) == 1
+    """The first numbers are the base, whose parts are timed, too; every other row changes one of them."""
+    config = EnvSpeedConfig(robots=(2, 1), particles=(10, 20), worlds=("fig5", "hall"), modes=("driver", "goal"))
+    base, *others = (trial for trial in trials(config) if trial.kind == STEP)
+    assert len(others) == 4
+    names = ("robots", "particles", "world", "mode")
+    for trial in trials(config):
+        changed = sum(getattr(trial, name) != getattr(base, name) for name in names)
+        assert changed == (trial in others)
 
 
-def test_stopping_early_keeps_finished_results() -> None:
-    """A benchmark stopped after two trials is incomplete and contains only its measurements."""
-    config = EnvBenchConfig(robots=(1,), particles=(5,), worlds=("fig5",), modes=("merging",), steps=3, peer=False)
-    asked: list[bool] = []
-
-    def should_stop() -> bool:
-        asked.append(True)
-        return len(asked) > 2
-
-    result = run_bench(config, should_stop=should_stop)
-    assert not result["complete"]
-    assert len(result["rows"]) == 1
-    assert result["budget"]
-    assert result["simulator"] is None
-    assert not result["snapshots"]
+def test_parts_of_a_step_are_summed_up() -> None:
+    """The table of parts ends with their sum."""
+    rows = [
+        {"kind": PART, "name": name, "median_us": us, "mean_us": us} for name, us in (("scans", 2.0), ("rest", 3.0))
+    ]
+    table = STUDY.tables[1]
+    assert [table.cells(line) for line in table.lines(rows)] == [
+        ["scans", "2", "2"],
+        ["rest", "3", "3"],
+        ["all", "5", "5"],
+    ]
 
 
 @pytest.mark.slow
 def test_the_command_writes_its_results(tmp_path: Path) -> None:
     """The run folder and the JSON have rows, budget, snapshots and resets; the config repeats the run."""
     out, file = tmp_path / "run", tmp_path / "figures.json"
-    arguments = ["bench", "env", "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat,goal",
-                 "--steps", "4", "--no-peer"]  # fmt: skip
+    arguments = ["bench", "speed", "env", "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes",
+                 "flat,goal", "--steps", "4", "--no-peer"]  # fmt: skip
     result = runner.invoke(app, [*arguments, "--out", str(out), "--json", str(file)])
     assert result.exit_code == 0, result.output
     figures = json.loads(file.read_text())
     assert figures == json.loads((out / "metrics.json").read_text())
-    assert [row["mode"] for row in figures["rows"]] == ["flat", "goal"]
-    assert all(row["calls"] == 4 and row["walls"] == 11 for row in figures["rows"])
-    assert figures["complete"]
-    assert figures["peer"] is None
-    assert {"get_state", "clone"} <= figures["snapshots"].keys()
-    assert figures["reset"]["calls"] > 0
-    again = runner.invoke(app, ["bench", "env", "--config", str(out / "config.toml"), "--out", str(tmp_path / "again")])
-    assert again.exit_code == 0, again.output
-    rows = json.loads((tmp_path / "again" / "metrics.json").read_text())["rows"]
+    rows = [row for row in figures["trials"] if row["kind"] == STEP]
     assert [row["mode"] for row in rows] == ["flat", "goal"]
+    assert all(row["calls"] == 4 and row["walls"] == 11 for row in rows)
+    others = {row["name"]: row for row in figures["trials"] if row["kind"] == OTHER}
+    assert {"get_state", "clone", "simulator only"} <= others.keys()
+    assert others["reset"]["calls"] > 0
+    assert sum(row["kind"] == PART for row in figures["trials"]) == len(env_budget.PHASES) + 1
+    again = ["bench", "speed", "env", "--config", str(out / "config.toml"), "--out", str(tmp_path / "again")]
+    result = runner.invoke(app, again)
+    assert result.exit_code == 0, result.output
+    repeated = json.loads((tmp_path / "again" / "metrics.json").read_text())["trials"]
+    assert [row["mode"] for row in repeated] == [row["mode"] for row in figures["trials"]]

@@ -1,7 +1,5 @@
 """Exploration benchmark: common worlds, metrics, summary and resuming."""
 
-import csv
-import io
 import json
 import sys
 from collections.abc import Iterator
@@ -10,28 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
-from training.bench.config import ExplorationBenchConfig, ExplorationTrial
-from training.bench.exploration import trials as exploration_trials
-from training.bench.exploration.players import parted
-from training.bench.exploration.report import (
-    FIGURES,
-    compare_oracles,
-    compare_policies,
-    curves,
-    draw_exploration,
-    label,
-    markdown,
-    print_tables,
-    summarise,
-)
+from training.bench.exploration.config import ExplorationConfig, Trial
+from training.bench.exploration.players import label, parted
+from training.bench.exploration.report import STUDY, TABLES
 from training.bench.exploration.trials import CURVE_POINTS, CURVES, TRIALS_FILE, count_merges, play
 from training.episodes.runner import MergeRecord
-from training.experiments.tables import csv_of
+from training.experiments.study import Column, ResultTable
 from vslam_env import vslam_v0
 
-SMALL = ExplorationBenchConfig(
+SMALL = ExplorationConfig(
     policies=("frontier", "random_walk", "frontier@continuous"), worlds=("fig5",), robots=(2,), duration=8.0,
     particles=20, seeds=2, seed=200,
 )  # fmt: skip
@@ -82,7 +68,8 @@ def rows() -> list[dict[str, Any]]:
 
 def _row(policy: str, seed: int, oracle: str = "none", **figures: Any) -> dict[str, Any]:
     """Return a row in which all other metrics are one half."""
-    values = dict.fromkeys(FIGURES, 0.5) | {"right_merges": 2, "false_merges": 0} | figures
+    columns = (column.name for table in TABLES for column in table.columns)
+    values = dict.fromkeys(columns, 0.5) | figures
     line = {"time_s": [0.0, 1.0]} | {name: [0.0, 0.1 * seed] for name in CURVES}
     return (
         {"policy": policy, "world": "office", "robots": 3, "oracle": oracle, "seed": seed} | values | {"curves": line}
@@ -92,14 +79,14 @@ def _row(policy: str, seed: int, oracle: str = "none", **figures: Any) -> dict[s
 def test_all_policies_of_a_seed_have_the_same_world() -> None:
     """Walls, landmarks and starts depend only on the seed and the split, not on policy, action type or oracle."""
 
-    def met(config: ExplorationBenchConfig, trial: ExplorationTrial) -> tuple[bytes, ...]:
+    def met(config: ExplorationConfig, trial: Trial) -> tuple[bytes, ...]:
         env = vslam_v0.parallel_env(config=config.environment(trial))
         env.reset(seed=trial.seed)
         return env.scene().walls.tobytes(), env.true_landmarks.tobytes(), env.true_start_poses.tobytes()
 
     places = {seed: {met(SMALL, trial) for trial in SMALL.trials() if trial.seed == seed} for seed in (200, 201)}
     assert [len(found) for found in places.values()] == [1, 1]
-    other = ExplorationBenchConfig.from_mapping(SMALL.to_mapping() | {"split": "test", "seed": 200})
+    other = ExplorationConfig.from_mapping(SMALL.to_mapping() | {"split": "test", "seed": 200})
     assert len({*places[200], *places[201], met(other, other.trials()[0])}) == 3
 
 
@@ -126,7 +113,7 @@ def test_a_trial_repeats_itself(rows: list[dict[str, Any]]) -> None:
 
 def test_custom_policies_can_be_compared(own_policy: str) -> None:
     """A policy can be given by its module; each of its invalid actions is counted."""
-    config = ExplorationBenchConfig(policies=(own_policy,), worlds=("fig5",), robots=(2,), duration=4.0, particles=10)
+    config = ExplorationConfig(policies=(own_policy,), worlds=("fig5",), robots=(2,), duration=4.0, particles=10)
     row = play(config, config.trials()[0])
     assert row["invalid_actions"] == 2 * 4  # two robots, one decision per second
     assert row["way_m"] == 0.0
@@ -135,7 +122,7 @@ def test_custom_policies_can_be_compared(own_policy: str) -> None:
 def test_team_policies_and_bounds_are_marked() -> None:
     """Team policies and bounds run by their labels, which stay in the rows; the bound `oracles` has all oracles."""
     labels = ("mtsp@team", "oracles@bound", "rollout@bound")
-    config = ExplorationBenchConfig(policies=labels, worlds=("fig5",), robots=(2,), duration=3.0, particles=10)
+    config = ExplorationConfig(policies=labels, worlds=("fig5",), robots=(2,), duration=3.0, particles=10)
     rows = [play(config, trial) for trial in config.trials() if trial.oracle == "none" and trial.seed == config.seed]
     assert [row["policy"] for row in rows] == list(labels)
     assert rows[1]["pose_error"] < TOLD_M < rows[0]["pose_error"]
@@ -154,7 +141,7 @@ def test_team_policies_and_bounds_are_marked() -> None:
 def test_unknown_labels_are_refused(label: str, says: str) -> None:
     """Unknown policies, bounds and action types are refused with the known ones."""
     with pytest.raises(ValueError, match=says):
-        ExplorationBenchConfig(policies=(label,))
+        ExplorationConfig(policies=(label,))
 
 
 def test_policies_that_fail_do_not_stop_the_others(vslam: Any, own_policy: str, tmp_path: Path) -> None:
@@ -177,7 +164,7 @@ def test_policies_that_fail_do_not_stop_the_others(vslam: Any, own_policy: str, 
     assert "6 of 8 trials failed" in done.out
     kept = [json.loads(line)["policy"] for line in (out / TRIALS_FILE).read_text().splitlines()]
     assert kept == ["frontier", "frontier"]
-    assert (out / "tables.md").read_text().startswith("### fig5, K=2, 2 seeds")
+    assert (out / "tables.md").read_text().startswith("**Coverage, fig5, K=2**")
 
 
 def _merge(time: float, error_m: float, undone: float | None = None) -> MergeRecord:
@@ -193,65 +180,58 @@ def test_merges_are_right_false_or_undone() -> None:
     assert count_merges([])["first_merge_s"] is None
 
 
+def _table(name: str) -> ResultTable:
+    return next(table for table in TABLES if table.name == name)
+
+
 def test_policies_are_compared_with_the_first_on_common_seeds() -> None:
-    """Differences are relative to the first policy; the share of better seeds accounts for the sign of the metric."""
-    rows = [_row("a", seed, mean_coverage=0.1 * seed, map_error=0.3) for seed in (1, 2, 3, 4)]
-    rows += [_row("b", seed, mean_coverage=0.1 * seed + 0.2, map_error=0.1 * seed) for seed in (1, 2, 4, 9)]
-    found = {line["figure"]: line for line in compare_policies(rows)}
-    assert {(line["policy"], line["than"], line["seeds"]) for line in found.values()} == {("b", "a", 3)}
-    covered = [found["mean_coverage"][name] for name in ("more", "more_low", "more_high", "better")]
-    np.testing.assert_allclose(covered, [0.2, 0.2, 0.2, 1.0])
-    assert found["map_error"]["better"] == pytest.approx(2 / 3)
-    assert compare_oracles(rows) == []
+    """Differences are relative to the first policy, seed by seed, with the same oracle."""
+    rows = [_row("a", seed, mean_coverage=0.1 * seed) for seed in (1, 2, 3, 4)]
+    rows += [_row("b", seed, mean_coverage=0.1 * seed + 0.2) for seed in (1, 2, 4, 9)]
+    (line,) = _table("policies").lines(rows)
+    assert (line["policy"], line["oracle"]) == ("b", "none")
+    np.testing.assert_allclose(line["over time [%]"], [0.2, 0.2, 0.2])
+    assert _table("policies").cells(line)[:3] == ["b", "none", "20.0 (20.0 .. 20.0)"]
+    assert _table("oracles").lines(rows) == []
 
 
 def test_oracles_are_compared_in_pairs() -> None:
-    """Each policy is compared with itself without the oracle."""
+    """Each policy is compared with itself without the oracle; unknown values do not count."""
     rows = [
-        _row("a", seed, oracle, map_rmse_m=0.1 * seed - 0.05 * (oracle == "all"))
+        _row("a", seed, oracle, map_error=0.1 * seed - 0.05 * (oracle == "all"), pose_error=None)
+        for oracle in ("all", "none")
         for seed in (1, 2)
-        for oracle in ("none", "all")
     ]
-    found = {line["figure"]: line for line in compare_oracles(rows)}
-    assert found["map_rmse_m"]["more"] == pytest.approx(-0.05)
-    assert (found["map_rmse_m"]["oracle"], found["map_rmse_m"]["than"]) == ("all", "none")
-    assert found["pose_error"]["better"] == 0.0
-    assert compare_policies(rows) == []
+    (line,) = _table("oracles").lines(rows)
+    assert line["oracle"] == "all"
+    assert line["E [cm]"].value == pytest.approx(-0.05)
+    assert line["pose [cm]"].value is None
+    assert _table("policies").lines(rows) == []
 
 
 def test_means_skip_seeds_without_a_merge() -> None:
     """The mean time of the first merge is over the seeds with a merge."""
-    (line,) = summarise([_row("a", 1, first_merge_s=None), _row("a", 2, first_merge_s=30.0)])
-    assert line["seeds"] == 2
-    assert line["first_merge_s"] == 30.0
-    assert line["first_merge_s_low"] is None
-    assert [row["coverage"] for row in curves([_row("a", 1), _row("a", 3)])] == pytest.approx([0.0, 0.2])
+    rows = [_row("a", 1, first_merge_s=None), _row("a", 2, first_merge_s=30.0)]
+    (line,) = _table("merges").lines(rows)
+    assert line["first [s]"].value == 30.0
+    assert _table("coverage").lines(rows)[0]["seeds"].value == 2
+    assert STUDY.curves is not None
+    assert [line["coverage"] for line in STUDY.curves.lines([_row("a", 1), _row("a", 3)])] == pytest.approx([0.0, 0.2])
 
 
-def test_tables_fit_into_80_columns(rows: list[dict[str, Any]]) -> None:
-    """Tables are not cut on a terminal of 80 columns; the Markdown has all policies, with and without oracles."""
-    lines = summarise(rows)
-    console = Console(file=io.StringIO(), width=80)
-    print_tables(console, lines, compare_policies(rows), compare_oracles(rows))
-    text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "…" not in text
-    assert text.count("oracle all\n") + text.count("oracle all ") >= 6
-    assert "random_walk, oracle all" in markdown(lines, compare_policies(rows), compare_oracles(rows))
+def test_tables_name_world_and_team_in_their_titles() -> None:
+    """There is a table for each world and number of robots, with a line for each policy and oracle."""
+    rows = [_row("a", 1), _row("a", 1, "all"), _row("a", 1) | {"world": "maze"}]
+    table = ResultTable(
+        name="", title="T", by=("world", "robots", "policy", "oracle"), columns=(Column("coverage", digits=0),),
+        each=("world", "robots"), words={"robots": ("robots", lambda robots: f"K={robots}")},
+    )  # fmt: skip
+    parts = dict(table.parts(table.lines(rows)))
+    assert table.headings == ["policy", "oracle", "coverage [%]"]
+    assert parts == {"T, office, K=3": [["a", "none", "50"], ["a", "all", "50"]], "T, maze, K=3": [["a", "none", "50"]]}
 
 
-def test_curves_are_drawn_and_written(rows: list[dict[str, Any]], tmp_path: Path) -> None:
-    """The CSV has a line per policy, oracle and time; the figure is a PNG file."""
-    found = list(csv.DictReader(io.StringIO(csv_of(curves(rows)))))
-    assert len(found) == 3 * 2 * CURVE_POINTS
-    last = [line for line in found if (line["policy"], line["oracle"]) == ("frontier", "none")][-1]
-    assert float(last["coverage"]) == pytest.approx(rows[0]["coverage"], rel=1e-5)
-    draw_exploration(tmp_path / "exploration.png", curves(rows))
-    assert (tmp_path / "exploration.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_stored_trials_are_not_run_again(
-    vslam: Any, own_policy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stored_trials_are_not_run_again(vslam: Any, own_policy: str, tmp_path: Path) -> None:
     """A stored trial is not run again; a truncated one is, with the same results."""
     out = tmp_path / "run"
     command = (
@@ -266,17 +246,14 @@ def test_stored_trials_are_not_run_again(
         ("frontier", 200), (own_policy, 200), ("frontier", 201), (own_policy, 201),
     ]  # fmt: skip
     assert len((out / "trials.csv").read_text().splitlines()) == 5
-    assert (out / "tables.md").read_text().startswith("### fig5, K=2, 2 seeds")
+    assert len((out / "curves.csv").read_text().splitlines()) == 1 + 2 * CURVE_POINTS
+    assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "tables.md").read_text().startswith("**Coverage, fig5, K=2**")
     (out / TRIALS_FILE).write_text("\n".join([*kept[:3], kept[3][:40]]))
-    played: list[ExplorationTrial] = []
-
-    def watched(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, Any]:
-        played.append(trial)
-        return play(config, trial)
-
-    monkeypatch.setattr(exploration_trials, "play", watched)
-    assert vslam(*command).status == 0
-    assert [(trial.policy, trial.seed) for trial in played] == [(own_policy, 201)]
+    said = vslam(*command)
+    assert said.status == 0
+    assert "3 of 4 trials are finished, 1 are left" in said.out
+    assert "…" not in said.out
     assert (out / TRIALS_FILE).read_text().splitlines()[:3] == kept[:3]
     again = json.loads((out / "metrics.json").read_text())["trials"]
     untimed = {"decision_ms": 0.0, "decision_p99_ms": 0.0}
@@ -289,11 +266,11 @@ def test_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         '{"name": "room", "walls": [[0, 0, 9, 0], [9, 0, 9, 7], [9, 7, 0, 7], [0, 7, 0, 0]]}'
     )
     monkeypatch.chdir(tmp_path)
-    config = ExplorationBenchConfig.from_mapping({"worlds": ["office", "room.json"]})
+    config = ExplorationConfig.from_mapping({"worlds": ["office", "room.json"]})
     assert config.worlds == ("office", str(tmp_path / "room.json"))
     assert config.environment(config.trials()[-1]).world_split is None  # a single layout has no splits
     assert config.environment(config.trials()[0]).world_split == "validation"
-    assert ExplorationBenchConfig.from_mapping(config.to_mapping() | {"seed": 0}) == config
+    assert ExplorationConfig.from_mapping(config.to_mapping() | {"seed": 0}) == config
 
 
 def test_labels_name_policies_in_tables() -> None:
@@ -302,9 +279,9 @@ def test_labels_name_policies_in_tables() -> None:
     assert (player.name, player.action_type, player.role) == ("frontier", "discrete", "robot")
     assert label("mine=frontier@discrete") == "mine@discrete"
     assert label("best=oracles@bound") == "best@bound"  # bounds stay marked
-    config = ExplorationBenchConfig(policies=("a=frontier", "b=frontier"), seeds=1)
+    config = ExplorationConfig(policies=("a=frontier", "b=frontier"), seeds=1)
     assert [trial.policy for trial in config.trials()[:2]] == ["a=frontier", "b=frontier"]
     with pytest.raises(ValueError, match="policies: expected a different label for each policy, got 'a'"):
-        ExplorationBenchConfig(policies=("a=frontier", "a=random_goals"))
+        ExplorationConfig(policies=("a=frontier", "a=random_goals"))
     with pytest.raises(ValueError, match="policy: expected one of 'frontier'"):
-        ExplorationBenchConfig(policies=("a=unknown",))
+        ExplorationConfig(policies=("a=unknown",))

@@ -28,8 +28,9 @@ from training.bench.exploration.plan import FLOOR_PLANS, Plan
 from training.bench.exploration.plan_report import (
     episodes_csv,
     markdown,
+    ordered,
     read_episodes,
-    sections,
+    tables,
     tidy_rows,
     write_parquet,
 )
@@ -349,12 +350,14 @@ def test_policies_are_ordered_and_compared_with_the_first() -> None:
         for seed in range(4)
     ]
     plan = Plan.load("vslam-bench-v0")
-    main, families, *_ = sections(plan, rows)
-    assert [row[0] for row in main.rows] == ["frontier", "random_walk"]
-    assert main.rows[0][1].startswith("18.8 (")  # the middle half of 0, 12.5, 25, 37.5 cm
-    assert main.rows[0][-1] == "-"
-    assert main.rows[1][-1].startswith("0.38 (")  # 3 + 2 + 1 of 16 pairs are better, none is equal
-    assert families.rows[1][1] == "25.0, 6.2 (6.2 .. 6.2)"
+    first, second = (
+        [table.cells(line) for line in table.lines(ordered(rows[::-1]))] for table in tables(plan, rows)[:2]
+    )
+    assert [cells[0] for cells in first] == ["frontier", "random_walk"]
+    assert first[0][1].startswith("18.8 (")  # the middle half of 0, 12.5, 25, 37.5 cm
+    assert first[0][-1] == "-"
+    assert first[1][-1].startswith("0.38 (")  # 3 + 2 + 1 of 16 pairs are better, none is equal
+    assert second[1][1] == "25.0, 6.2 (6.2 .. 6.2)"
     text = markdown(plan, rows, ("frontier", "tare"))
     assert "There are no rows of floor plans" in text
     assert "`frontier` has 8 of 150 episodes of the base part" not in text

@@ -1,12 +1,13 @@
-"""`vslam bench start`: its rows, its fresh places, and what it refuses."""
+"""`vslam bench speed start`: its rows, its fresh places, and what it refuses."""
 
 import os
 from pathlib import Path
 
 import pytest
 
-from training.bench.config import StartBenchConfig
-from training.bench.start.bench import FIGURES, cells, check_wheel, fresh_place, markdown, on_two_cores, run_bench
+from training.bench.speed import start
+from training.bench.speed.config import StartSpeedConfig
+from training.bench.speed.start import FIGURES, STUDY, fresh_place, on_two_cores, play, trials
 
 
 def test_places_have_neither_caches_nor_settings(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,26 +35,30 @@ def test_two_cores_are_used_and_given_back() -> None:
     assert os.sched_getaffinity(0) == before
 
 
-def test_each_part_has_rows_with_medians() -> None:
-    """Counts need no unit, times have one, and a part that was not run shows dashes."""
-    result = run_bench(StartBenchConfig(parts=("count",), repeats=2))
-    kernels, many = result["figures"]
-    assert result["complete"]
-    assert kernels["values"][0] == kernels["values"][1] > many["values"][0] > 0
-    assert cells(kernels)[1] == str(int(kernels["values"][0]))
-    stopped = run_bench(StartBenchConfig(parts=("wheel",)), should_stop=lambda: True)
-    assert not stopped["complete"]
-    assert cells(stopped["figures"][0])[1:] == ("- s", "- s", "- s", "0", "15 s")
-    assert len(markdown(stopped).splitlines()) == 2 + len(FIGURES["wheel"])
+def test_figures_have_units_and_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counts need no unit, times have one; a part is measured once for all its figures."""
+    calls: list[None] = []
+    monkeypatch.setattr(start, "count", lambda: calls.append(None) or (len(calls), 3.0))
+    start.measured.cache_clear()
+    config = StartSpeedConfig(parts=("count",), repeats=2)
+    rows = [{"part": t.part, "figure": t.figure} | play(config, t) for t in trials(config)]
+    start.measured.cache_clear()
+    table = STUDY.tables[0]
+    kernels, many = map(table.cells, table.lines(rows))
+    assert len(calls) == 2
+    assert kernels == ["count", "kernels", "2", "1", "2", "2", "200"]
+    assert many[2:] == ["3", "3", "3", "2", "15"]
+    (steps,) = table.lines([{"part": "steps", "figure": FIGURES["steps"][0].name, "value": 2.0}])
+    assert table.cells(steps)[2:] == ["2 s", "2 s", "2 s", "1", "30 s"]
 
 
 def test_a_wheel_is_a_part_of_its_own(tmp_path: Path) -> None:
-    """Naming one adds the part; asking for the part without one is refused."""
+    """Naming one adds the part; a wheel that is not there is refused, as is the part without one."""
     wheel = tmp_path / "some.whl"
-    config = StartBenchConfig(wheel=str(wheel)).with_wheel()
-    assert config.parts[-1] == "wheel"
-    assert config.with_wheel().parts == config.parts
-    with pytest.raises(ValueError, match="wheel: expected the wheel that `make kernels-wheel` writes, got '"):
-        check_wheel(config)
+    for given in ({"wheel": str(wheel)}, {"parts": ("wheel",)}):
+        with pytest.raises(ValueError, match="wheel: expected the wheel that `make kernels-wheel` writes, got"):
+            StartSpeedConfig(**given)
     wheel.touch()
-    check_wheel(config)
+    for parts in (("count",), ("count", "wheel")):
+        found = trials(StartSpeedConfig(parts=parts, wheel=str(wheel), repeats=1))
+        assert list(dict.fromkeys(trial.part for trial in found)) == ["count", "wheel"]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from slam_backend.geometry import inverse, transform_points
-from training.bench.filter.bench import filled_filter
-from training.bench.filter.workload import FilterLoad, LoadWorld
+from training.bench.speed.filter import filled_filter
+from training.bench.speed.workload import FilterLoad, LoadWorld
 
 SMALL: dict[str, Any] = {"particles": 7, "landmarks": 60, "measurements": 11}
 

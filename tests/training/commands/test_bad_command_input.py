@@ -64,12 +64,12 @@ BAD: dict[str, dict[str, str]] = {
         "": "path: expected a value, got 'none'. Give --path.",
         "--path .": "reader: expected MODULE:NAME of a reader, got ",
     },
-    "bench filter": {
+    "bench speed filter": {
         "--particles 10;20": f"particles: {LIST} '10;20'. Write them like",
         "--landmarks 20": "landmarks: expected an int >= 30, got 20.",
     },
-    "bench env": {"--robots 9": f"{ROBOTS} 9", "--worlds castle": "world: expected one of 'office'"},
-    "bench start": {
+    "bench speed env": {"--robots 9": f"{ROBOTS} 9", "--worlds castle": "world: expected one of 'office'"},
+    "bench speed start": {
         "--parts imports": "parts: expected one of 'demo', 'kernels', 'steps', 'wheel', 'import', 'count'",
         "--parts wheel": "wheel: expected the wheel that `make kernels-wheel` writes, got None.",
     },

@@ -24,17 +24,17 @@ LEAST = {
     "replay victoria": ("--path", "park", "--duration", "6", "--particles", "3"),
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
-    "bench filter": (
+    "bench speed filter": (
         "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
     ),
-    "bench env": (
+    "bench speed env": (
         "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat", "--steps", "2", "--no-peer",
     ),
     "bench exploration": (
         "--policies", "frontier", "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--max-seconds", "2",
         "--particles", "5", "--seeds", "1", *SEED,
     ),
-    "bench start": ("--parts", "count", "--repeats", "1"),
+    "bench speed start": ("--parts", "count", "--repeats", "1"),
     "paper fig1": ("--length", "3", "--particles", "5", "--every", "2"),
     "paper fig2": ("--seeds", "1", "--length", "5", "--every", "5", "--particles", "5", *SEED),
     "paper fig3": ("--seed", "100", "--length", "20", "--particles", "20"),

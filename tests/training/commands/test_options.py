@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from training.commands import _progress
 from training.commands._options import numbers, options, words
-from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
+from training.commands._progress import TrialSet, run_trial_set, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.experiments.config import ExperimentConfig, Positive, option, setting
 from training.experiments.run_folder import RunFolder
@@ -46,10 +46,10 @@ def play(trial: Trial) -> dict[str, Any]:
     return asdict(trial) | {"square": trial.seed**2}
 
 
-def _part(seeds: range, play: Callable[[Trial], dict[str, Any]], file: str = "trials.jsonl") -> TrialSet:
+def _part(seeds: range, play: Callable[[Trial], dict[str, Any]]) -> TrialSet:
     return TrialSet(
-        file=file, kind=Trial, play=play, trials=[Trial(seed=seed) for seed in seeds],
-        tell=lambda row: f"seed {row['seed']}", cost=lambda trial: 1 + trial.seed,
+        file="trials.jsonl", kind=Trial, play=play, trials=[Trial(seed=seed) for seed in seeds],
+        tell=lambda row: f"seed {row['seed']}",
     )  # fmt: skip
 
 
@@ -178,31 +178,30 @@ def test_a_stopped_command_can_be_resumed(tmp_path: Path) -> None:
             signal.raise_signal(signal.SIGINT)
         return play(trial)
 
-    parts = (_part(range(3), stopping), _part(range(5, 7), play, "others.jsonl"))
-    rows = run_trial_sets(shown, folder, *parts)
-    assert [[row["seed"] for row in own] for own in rows] == [[0, 1], []]
-    assert f"Stopped after 2 of 5 trials; resume with --out {folder.path}." in shown.export_text()
-    rows = run_trial_sets(shown, folder, *parts)
-    assert f"Resuming {folder.path}: 2 of 5 trials are finished, 3 are left." in shown.export_text(clear=False)
+    part = _part(range(3), stopping)
+    assert [row["seed"] for row in run_trial_set(shown, folder, part)] == [0, 1]
+    assert f"Stopped after 2 of 3 trials; resume with --out {folder.path}." in shown.export_text()
+    rows = run_trial_set(shown, folder, part)
+    assert f"Resuming {folder.path}: 2 of 3 trials are finished, 1 are left." in shown.export_text(clear=False)
     assert played == [0, 1, 2]
-    assert [[row["square"] for row in own] for own in rows] == [[0, 1, 4], [25, 36]]
+    assert [row["square"] for row in rows] == [0, 1, 4]
     assert "Stopped" not in shown.export_text()
 
 
-def test_a_bar_counts_what_trials_cost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each trial is shown with its name, and its cost is counted; libraries have one thread meanwhile."""
+def test_a_bar_counts_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each trial is shown with its name, and counted; libraries have one thread meanwhile."""
     import numpy as np  # noqa: F401   # a library with threads
     from threadpoolctl import threadpool_info
 
     monkeypatch.setattr(_progress, "REDRAW_S", 0.0)
     shown = Console(file=io.StringIO(), width=100, force_terminal=True)
     with trial_progress(shown, 10, 4) as (advance, interrupted):
-        advance("the third", 3)
+        advance("the fifth")
         assert not interrupted()
         assert {pool["num_threads"] for pool in threadpool_info()} <= {1}
         text = shown.file.getvalue()  # type: ignore[attr-defined]
-    assert "the third" in text
-    assert "70%" in text
+    assert "the fifth" in text
+    assert "50%" in text
 
 
 def test_lines_go_above_a_bar_of_shares() -> None:

@@ -10,7 +10,8 @@ from slam_backend.frontend import DESCRIPTORS
 from slam_backend.maps.alignment import METHODS
 from slam_backend.readers.stereo_files import StereoFiles
 from studies import accuracy, alignment, losses, mrclam_pairs, stereo, training_speed
-from training.bench import config as bench
+from training.bench.exploration import config as exploration
+from training.bench.speed import config as speed
 from training.episodes.config import RunConfig
 from training.experiments import config as experiments
 from training.experiments.config import ExperimentConfig
@@ -27,11 +28,11 @@ from vslam_env.world import SPLITS
 # Required values of each class, and a value that differs from its default.
 CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     accuracy.Config: {"lengths": (5.0, 7.5)}, losses.Config: {"worlds": ("fig5",), "presets": ("hard",)},
-    bench.EnvBenchConfig: {"worlds": ("fig5",)},
-    bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
-    bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
-    bench.PlanBenchConfig: {"plan": "vslam-bench-v0", "policies": ("frontier",), "quick": True},
-    bench.StartBenchConfig: {"parts": ("import",), "repeats": 1}, stereo.Config: {"descriptors": ("orb",)},
+    speed.EnvSpeedConfig: {"worlds": ("fig5",)},
+    exploration.ExplorationConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
+    speed.FilterSpeedConfig: {"proposals": ("fastslam1",), "large": True},
+    exploration.PlanConfig: {"plan": "vslam-bench-v0", "policies": ("frontier",), "quick": True},
+    speed.StartSpeedConfig: {"parts": ("import",), "repeats": 1}, stereo.Config: {"descriptors": ("orb",)},
     training_speed.Config: {"workers": (0, 2)},
     mrclam_pairs.Config: {"path": "log", "durations": (50.0,)},
     EvaluateConfig: {"model": str(Path("model.npz").resolve()), "policies": ("random_goals",)},
@@ -60,27 +61,27 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "presets": {("fine",): "one of 'easy', 'standard', 'hard'"}, "duration": {0.0: "a finite number >= 1"},
         "baselines": {(0.0,): ABOVE_0}, "robots": {(9,): ROBOTS},
     },
-    bench.EnvBenchConfig: {
+    speed.EnvSpeedConfig: {
         "robots": {(9,): ROBOTS}, "modes": {("image",): "one of 'driver', 'poses'"}, "steps": {1: "an int >= 2"},
         "particles": {(0,): AT_LEAST_1}, "plays": {0: AT_LEAST_1}, "peer": {1: "a bool"},
     },
-    bench.ExplorationBenchConfig: {
+    exploration.ExplorationConfig: {
         "split": {"all": "one of 'train', 'validation', 'test', 'any'"}, "robots": {(9,): ROBOTS},
         "oracles": {("pose", "fate"): "one of 'none', 'pose', 'association', 'merge', 'all'"},
         "duration": {0.0: "a finite number >= 1"}, "seeds": {0: AT_LEAST_1},
         "preset": {"dire": "one of 'easy', 'standard', 'hard'"}, "rejuvenate_every": {-1: AT_LEAST_0},
         "policies": {("frontier", "frontier"): "at least one value, each once", (3,): "a text"},
     },
-    bench.FilterBenchConfig: {
+    speed.FilterSpeedConfig: {
         "steps": {0: AT_LEAST_1}, "proposals": {("ekf",): "one of 'fastslam2', 'fastslam1'"},
         "particles": {(5, 5): "at least one value, each once"}, "lookalikes": {0: AT_LEAST_1},
         "landmarks": {(9,): "an int >= 10"},
     },
-    bench.PlanBenchConfig: {
+    exploration.PlanConfig: {
         "decision_limit": {0.0: ABOVE_0}, "quick": {1: "a bool"}, "plan": {3: "a text"},
         "policies": {("frontier", "frontier"): "at least one value, each once"},
     },
-    bench.StartBenchConfig: {"repeats": {0: AT_LEAST_1}, "parts": {("none",): "one of"}},
+    speed.StartSpeedConfig: {"repeats": {0: AT_LEAST_1}, "parts": {("none",): "one of"}},
     stereo.Config: {
         "sizes": {(32,): "an int >= 64"}, "walls": {(3,): "an int >= 4"}, "views": {0: AT_LEAST_1},
     },
@@ -221,6 +222,6 @@ def test_choices_match_the_packages() -> None:
     assert paper.STEP == runs.STEP
     assert tuple(TRAIN_PRESETS) == ("quick", "imitate", "ppo", "smoke")
     assert paper.Fig6Config().regimes == tuple(REGIMES)
-    assert bench.EnvBenchConfig().robots[-1] == MAX_ROBOTS
+    assert speed.EnvSpeedConfig().robots[-1] == MAX_ROBOTS
     assert set(SPLITS) < {"train", "validation", "test", "any"}
     assert replay.ImagesConfig(path="room").files == StereoFiles()

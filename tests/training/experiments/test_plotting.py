@@ -4,10 +4,13 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
+import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from training.experiments import study_chart
 from training.experiments.plotting import save_png
+from training.experiments.study import Chart, Column, Panel
 
 
 def _figure() -> Figure:
@@ -42,3 +45,15 @@ def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
         save_png(_figure(), tmp_path / name, 80)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_panels_without_values_leave_no_gaps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Panels of a row that has no values are left out, and each row is named once."""
+    drawn: list[Figure] = []
+    monkeypatch.setattr(study_chart, "save_png", lambda figure, file, dpi: drawn.append(figure))
+    rows = [{"k": "a", "x": 1, "u": 1.0, "v": 2.0}, {"k": "b", "x": 1, "u": 1.0}, {"k": "c", "x": 1, "u": 3.0}]
+    panels = tuple(Panel(column=Column(name)) for name in "uv")
+    study_chart.draw_chart(tmp_path / "chart.png", Chart(x="x", label="x", rows="k", panels=panels), rows)
+    shown = [ax for ax in drawn[0].axes if ax.get_visible()]
+    assert [ax.get_ylabel() for ax in shown] == ["u", "v", "u", "u"]
+    assert [ax.get_title(loc="left") for ax in shown] == ["a", "", "b", "c"]

@@ -56,7 +56,7 @@ def test_paths_are_of_odometry_and_of_the_filter(run: StereoRun, moved: Clouds, 
         slam.step(**reading)
     np.testing.assert_array_equal(measured.paths[1, -1], slam.pose(1).mean)
     for clouds in (moved, measured):
-        own = path_errors(run, clouds)
+        own = path_errors(run, clouds, "path")
         apart = np.linalg.norm((clouds.paths[0, -1] - run.true_paths[0, -1])[:2])
         assert own[0]["end_error_m"] == pytest.approx(apart)
         assert own[0]["end_spread_m"] == clouds.spreads()[-1, 0]
@@ -78,8 +78,9 @@ def test_the_command_writes_figure_and_errors(vslam: Any, tmp_path: Path) -> Non
     for rest in ([*arguments, "--out", str(first)], ["paper", "fig1", "--config", str(first), "--out", str(again)]):
         said = vslam(*rest)
         assert said.status == 0
-        assert "robot 3, measurements: path RMS" in said.out
+        assert "final spread" in said.out
     assert (first / "fig1.png").read_bytes().startswith(b"\x89PNG")
     found = [json.loads((out / "metrics.json").read_text()) for out in (first, again)]
     assert found[0] == found[1]
-    assert len(found[0]["measurements"]) == len(found[0]["odometry"]) == 3
+    rows = [(row["path"], row["robot"]) for row in found[0]["trials"]]
+    assert rows == [(path, robot) for path in ("odometry", "estimate") for robot in (1, 2, 3)]

@@ -1,7 +1,5 @@
 """`vslam paper fig5`: walls restrict the view, in the data and in the picture."""
 
-import csv
-import io
 import json
 from pathlib import Path
 
@@ -12,7 +10,7 @@ from typer.testing import CliRunner
 
 from training.cli import app
 from training.paper.config import Fig5Config
-from training.paper.fig5 import STATES, Fig5, simulate_fig5
+from training.paper.fig5 import STATES, TABLE, Fig5, simulate_fig5
 
 runner = CliRunner()
 
@@ -60,12 +58,15 @@ def test_measured_landmarks_are_visible(found: Fig5) -> None:
 
 
 def test_the_table_matches_the_figure(found: Fig5) -> None:
-    """The CSV has a row for each landmark in a robot's view, with its state."""
-    rows = list(csv.DictReader(io.StringIO(found.to_csv())))
+    """There is a row for each landmark in a robot's view, with its state, and a line for each robot and for all."""
+    rows = found.rows()
     assert len(rows) == found.in_view.sum()
     counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
     assert counts["hidden"] == (found.in_view & ~found.seen).sum()
     assert counts["measured"] == found.measured.sum()
+    *robots, whole = TABLE.lines(rows)
+    assert whole["in view"].value == len(rows) == sum(line["in view"].value for line in robots)
+    assert whole["seen"].value == found.seen.sum()
     row = rows[0]
     np.testing.assert_allclose(float(row["landmark_x"]), found.landmarks[int(row["landmark"]), 0], atol=1e-4)
 
@@ -80,5 +81,5 @@ def test_the_command_writes_picture_and_table(tmp_path: Path) -> None:
     assert picture.shape[1] > 900
     assert np.ptp(picture.reshape(-1, 3).astype(int), axis=0).min() > 150
     metrics = json.loads((out / "metrics.json").read_text())
-    assert len(metrics["robots"]) == 2
-    assert (out / "fig5.csv").read_text().startswith("robot,x,y,theta,landmark")
+    assert metrics["tables"]["robots"][-1]["in view"] == len(metrics["trials"]) > 0
+    assert (out / "trials.csv").read_text().startswith("robot,x,y,theta,landmark")

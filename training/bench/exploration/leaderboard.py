@@ -5,18 +5,19 @@ import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import argument_error
 from training.bench.exploration.plan import BASE_PART, FLOOR_PLANS, Plan
-from training.bench.exploration.plan_report import incomplete, markdown, read_episodes
-from training.bench.exploration.report import label
+from training.bench.exploration.plan_report import incomplete, markdown, read_episodes, section
+from training.bench.exploration.players import label
 from training.bench.exploration.verification import OUTCOMES, last_outcomes
 from training.experiments.run_folder import read_config
 from training.experiments.statistics import grouped
-from training.experiments.tables import markdown_table
+from training.experiments.study import Column, ResultTable
 
 EPISODES = ("episodes.csv", "episodes.csv.gz")
 ABOUT = (
@@ -104,20 +105,29 @@ def leaderboard(results: Sequence[Results], figure: str) -> str:
     """
     rows = played_rows(results)
     verified = {policy: counts for each in results for policy, counts in each.verified.items()}
-    shown = [
-        [label(policy), str(len(group)), *map(str, verified.get(policy, "-" * len(OUTCOMES)))]
-        for (policy,), group in grouped(rows, ("policy",)).items()
-    ]
-    headings = ("policy", "episodes", f"again: {OUTCOMES[0]}", *OUTCOMES[1:])
+    again = ResultTable(
+        name="verification", title="Verification", by=("policy",), words={"policy": ("policy", label)},
+        note="Episodes of each policy that were played again at the last verification: all bits are compared where "
+        "versions are the same and the processor can do the same, all results up to a ten-thousandth elsewhere.",
+        columns=(
+            Column("episodes", statistic=len, digits=0),
+            *(
+                Column(outcome, "" if i else f"again: {outcome}", partial(_verified, verified, i), digits=0)
+                for i, outcome in enumerate(OUTCOMES)
+            ),
+        ),
+    )  # fmt: skip
     machines = sorted({str(row["machine"]) for row in rows})
     text = "\n".join([
         "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n",
-        markdown(results[0].plan, rows, ()), "### Verification\n",
-        "Episodes of each policy that were played again at the last verification: all bits are compared where "
-        "versions are the same and the processor can do the same, all results up to a ten-thousandth elsewhere.\n",
-        markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",
+        markdown(results[0].plan, rows, ()), section(again, again.lines(rows)), f"Played on: {'; '.join(machines)}.\n",
     ])  # fmt: skip
     return "\n".join(line if line[:1] in "#!|" else _wrapped(line) for line in text.split("\n"))
+
+
+def _verified(counts: Mapping[str, Sequence[int]], outcome: int, rows: Sequence[Mapping[str, Any]]) -> int | None:
+    """Return the number of episodes of a policy with an outcome, None if none were played again."""
+    return counts[rows[0]["policy"]][outcome] if rows[0]["policy"] in counts else None
 
 
 def _wrapped(line: str) -> str:

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from slam_backend.core.text_files import read_toml
 from slam_backend.core.validation import argument_error, choice_error
-from training.bench.config import ALL_ORACLES, ORACLES, world_split
-from training.bench.exploration.players import parted
+from training.bench.exploration.players import environment_of
 from training.experiments.config import Checked, NoisePreset, Positive, RobotCount
 
 if TYPE_CHECKING:
@@ -161,23 +160,16 @@ class Plan(Checked):
 
     def environment(self, trial: PlanTrial) -> "EnvConfig":
         """Return the environment of an episode; all policies of a seed have the same world."""
-        from training.episodes.config import RunConfig
-
-        player, world = parted(trial.policy), trial.world
+        world = trial.world
         if trial.family == FLOOR_PLANS:
             found = _find_floor_plan(world, self.floor_plans[world], _data())
             if found is None:
                 raise argument_error("VSLAM_DATA", f"a folder with {world!r}", _data(), "Set it to the data folder.")
             world = str(found)
-        config = RunConfig(
-            world=world, robots=trial.robots, policy=player.policy, particles=trial.particles, seed=trial.seed,
-            action_type=player.action_type, preset=trial.preset, max_seconds=trial.duration,  # type: ignore[arg-type]
-        ).environment()  # fmt: skip
-        has_all = trial.oracle == ALL_ORACLES or player.needs_oracles
-        changes: dict[str, Any] = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}
-        if trial.comm_loss is not None:
-            changes["comm_loss"] = trial.comm_loss
-        return config.replace(world_split=world_split(self.split, world), **changes)
+        config = environment_of(
+            trial, world, self.split, trial.duration, particles=trial.particles, preset=trial.preset
+        )
+        return config if trial.comm_loss is None else config.replace(comm_loss=trial.comm_loss)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,10 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,9 +22,11 @@ from training.bench.exploration.aggregate import (
     stratified_ci,
 )
 from training.bench.exploration.plan import BASE_PART, FLOOR_PLANS, Plan, PlanTrial
-from training.bench.exploration.report import COLOURS, STYLES, label
+from training.bench.exploration.players import label
 from training.experiments.plotting import picture, save_png
 from training.experiments.statistics import grouped
+from training.experiments.study import Chart, Column, Estimate, Panel, ResultTable, Statistic
+from training.experiments.study_chart import COLOURS, STYLES, draw_panel
 from training.experiments.tables import E_SCALE, csv_text, markdown_table, number
 
 Rows = Sequence[Mapping[str, Any]]
@@ -35,40 +38,110 @@ PROFILE_CM = (10.0, 20.0, 30.0, 40.0)
 THRESHOLDS = np.linspace(0.0, 0.75, 151)  # of E [m]
 CM = 100.0
 REFUSED = "refused: "  # columns of the number of refused merges by reason
-TEXTS = (
-    "part",
-    "policy",
-    "family",
-    "world",
-    "oracle",
-    "preset",
-    "digest",
-    "policy_digest",
-    "machine",
-)  # columns of texts
+# Columns of texts
+TEXTS = ("part", "policy", "family", "world", "oracle", "preset", "digest", "policy_digest", "machine")
+
+# ------------------------------------------------------------------ tables
 
 
-class Section(NamedTuple):
-    """Table with its title and a note below it."""
+def tables(plan: Plan, rows: Rows) -> list[ResultTable]:
+    """Return the tables of a plan; their columns depend on what was played."""
+    base = _of(rows, part=BASE_PART)
+    first = next((name for name in plan.policies if _of(base, policy=name)), None)
+    other, sizes, parts = _of(base, policy=first), _of(rows, part=TEAM_SIZE), plan.all_parts()
+    worlds = len(grouped(base, ("family", "seed")))
 
-    title: str
-    note: str
-    headings: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    def of_base(name: str, title: str, note: str, heading: str, *columns: Column) -> ResultTable:
+        return ResultTable(
+            name=name, title=title, note=note, by=("policy",), columns=columns, words={"policy": (heading, label)},
+            where=lambda row: row["part"] == BASE_PART,
+        )  # fmt: skip
+
+    compared = f" P: probability that the map of a random world is better than one of `{first}`."
+    whole = {row["policy"] for row in rows if (row["part"], row["oracle"]) == (ORACLES, "all")}
+    return [
+        of_base(
+            "worlds", "All worlds",
+            f"Interquartile means over {worlds} worlds, with 95 % intervals." + compared * (first is not None),
+            "all worlds",
+            _e_column("E [cm]"), _column("coverage over time [%]", _ci("mean_coverage")),
+            _column("T50 [s]", _iqm("below_50_s"), 0, 1.0), _column("T90 [s]", _iqm("below_90_s"), 0, 1.0),
+            _column("recall [%]", _iqm("map_recall")), _column("ATE [cm]", _iqm("ate_start_m")),
+            _column("NEES", _iqm("nees"), 1, 1.0), Column("decision_p99_ms", "decision, p99 [ms]", digits=1),
+            _column("P", partial(_improvement, other), 2, 1.0),
+        ),
+        of_base(
+            "families", "Families",
+            f"Means of E [cm] and, behind the comma, paired differences to `{first}` with their 95 % intervals.",
+            "E [cm]",
+            *(_column(family, partial(_in_family, family, other)) for (family,) in grouped(base, ("family",))),
+        ),
+        of_base(
+            "errors", "What the map error consists of",
+            "Shares of the mean of E^2 [%]; RMSE of the landmarks found, and the share of found ones that exist.",
+            "parts of E^2 [%]",
+            *(_column(name, partial(_share_of_error, name)) for name in PARTS_OF_E),
+            Column("map_rmse_m", "RMSE [cm]", digits=1, factor=CM),
+            Column("map_precision", "precision [%]", digits=1, factor=CM),
+        ),
+        of_base(
+            "merges", "Merges and driving",
+            "Overlap: share of the seen floor that two robots have seen. Balance: shortest over longest path of a "
+            "team. The last columns count refused attempts by reason.",
+            "per episode",
+            Column("right_merges", "merged", digits=2), Column("false_merges", "false", digits=2),
+            Column("undone_merges", "undone", digits=2), Column("last_merge_s", "last [s]", digits=0),
+            Column("overlap", "overlap [%]", digits=0, factor=CM), Column("way_m", "path [m]", digits=0),
+            Column("balance", digits=2), Column("collisions", "collisions [s]", digits=1, factor=0.1),
+            Column("bytes_sent", "sent [kB]", digits=0, factor=1e-3),
+            *(
+                _column(reason, partial(_refused, reason), 1, 1.0)
+                for reason in sorted({reason for row in base for reason in row["refusals"]})
+            ),
+        ),
+        of_base(
+            "profile", "Performance profile", "Share of the worlds with a smaller map error.", "worlds [%]",
+            *(_column(f"E < {limit:g} cm", partial(_share_below, limit / CM), 0) for limit in PROFILE_CM),
+        ),
+        ResultTable(
+            name="factors", title="One factor at a time", by=("policy",), words={"policy": ("E [cm]", label)},
+            note="Interquartile means of E [cm] with 95 % intervals; all else as in the base part.",
+            columns=tuple(
+                _e_column(parts[name].title, part=name) for name in FACTORS if name in parts and _of(rows, part=name)
+            ),
+            where=lambda row: row["part"] in FACTORS,
+        ),
+        ResultTable(
+            name="oracles", title="Oracle ladder", by=("policy",), words={"policy": ("E [cm]", label)},
+            note="E [cm] without oracles; what knowing the poses, the landmarks' identities, the alignment of maps, "
+            "and all three takes off it, paired; and what is left with all: landmarks that exploration did not reach.",
+            columns=(
+                _column("none", partial(_with_all, BASE_PART)), _column("localisation", partial(_rung, "pose")),
+                _column("association", partial(_rung, "association")), _column("merging", partial(_rung, "merge")),
+                _column("all", partial(_rung, "all")), _column("left: exploration", partial(_with_all, ORACLES)),
+            ),
+            where=lambda row: row["policy"] in whole and row["part"] in (BASE_PART, ORACLES),
+        ),
+        ResultTable(
+            name="team_size", title="Team size and particles", by=("particles",),
+            note=f"Interquartile means of E [cm] of {_names(sizes)}: Fig. 6b of the paper, with robots that explore.",
+            words={"particles": ("E [cm]", lambda particles: f"{particles} particles")},
+            columns=tuple(
+                _e_column(f"K = {robots}", robots=robots)
+                for robots in sorted({row["robots"] for row in sizes})
+            ),
+            where=lambda row: row["part"] == TEAM_SIZE,
+        ),
+    ]  # fmt: skip
 
 
-def sections(plan: Plan, rows: Rows) -> list[Section]:
-    """Return all tables for which there are rows; policies are ordered by their map error in the base part."""
-    base = [row for row in rows if row["part"] == BASE_PART]
-    first = next((name for name in plan.policies if any(row["policy"] == name for row in base)), None)
-    found = []
-    if base:
-        order = sorted({row["policy"] for row in base}, key=lambda name: float(_iqm(base, name, "map_error")))
-        found += [_overall(base, order, first), _families(base, order, first), _error_table(base, order)]
-        found += [_merge_table(base, order), _profile_table(base, order)]
-        found += [_factors(plan, rows, order), _ladder(rows, order)]
-    found.append(_team_sizes(rows))
-    return [section for section in found if section.rows]
+def ordered(rows: Rows) -> list[Mapping[str, Any]]:
+    """Return the rows policy by policy, ordered by the map error in the base part."""
+    errors = {
+        policy: _iqm("map_error")(_of(own, part=BASE_PART)) for (policy,), own in grouped(rows, ("policy",)).items()
+    }
+    known = {policy: np.inf if error is None else error for policy, error in errors.items()}
+    return sorted(rows, key=lambda row: known[row["policy"]])
 
 
 def markdown(plan: Plan, rows: Rows, policies: Sequence[str]) -> str:
@@ -78,12 +151,19 @@ def markdown(plan: Plan, rows: Rows, policies: Sequence[str]) -> str:
         policies: Labels of the policies that should have rows.
     """
     parts = [f"Plan {plan.name}, hash {plan.digest}. {E_SCALE}\n"]
-    if plan.floor_plans and not any(row["family"] == FLOOR_PLANS for row in rows):
+    if plan.floor_plans and not _of(rows, family=FLOOR_PLANS):
         parts.append("There are no rows of floor plans: they need `VSLAM_DATA`, and `--quick` leaves them out.\n")
     parts += [f"Not a complete result: {text}.\n" for text in incomplete(plan, rows, policies)]
-    for section in sections(plan, rows):
-        parts.append(f"### {section.title}\n\n{section.note}\n\n{markdown_table(section.headings, section.rows)}")
+    for table in tables(plan, rows):
+        if lines := table.lines(ordered(rows)):
+            parts.append(section(table, lines))
     return "\n".join(parts)
+
+
+def section(table: ResultTable, lines: Rows) -> str:
+    """Return a table as a section of a page."""
+    cells = markdown_table(table.headings, list(map(table.cells, lines)))
+    return f"### {table.title}\n\n{table.note}\n\n{cells}"
 
 
 def incomplete(plan: Plan, rows: Rows, policies: Sequence[str]) -> list[str]:
@@ -101,18 +181,6 @@ def incomplete(plan: Plan, rows: Rows, policies: Sequence[str]) -> list[str]:
         played = sum(row["policy"] == policy for row in base_rows)
         if played < wanted:
             found.append(f"`{label(policy)}` has {played} of {wanted} episodes of the base part")
-    return found
-
-
-def aggregate(plan: Plan, rows: Rows) -> list[dict[str, Any]]:
-    """Return a line for each part and policy: worlds, and interquartile means of the main metrics with intervals."""
-    found = []
-    for (part, policy), group in grouped(rows, ("part", "policy")).items():
-        line: dict[str, Any] = {"part": part, "policy": policy, "episodes": len(group)}
-        for name in ("map_error", "mean_coverage", "below_50_s", "below_90_s", "map_recall", "ate_start_m"):
-            worlds = [np.array([row[name] for row in family]) for family in grouped(group, ("family",)).values()]
-            line |= dict(zip((name, f"{name}_low", f"{name}_high"), stratified_ci(worlds, pooled(iqm)), strict=True))
-        found.append(line)
     return found
 
 
@@ -177,7 +245,7 @@ def write_parquet(file: Path, rows: Rows) -> bool:
 def draw_plan(file: Path, rows: Rows) -> None:
     """Draw profiles of E in the base part, and E over team sizes and particles, as far as played, into a PNG file."""
     parts = {BASE_PART: _draw_profiles, TEAM_SIZE: _draw_team_sizes}
-    played = [(draw, own) for part, draw in parts.items() if (own := [row for row in rows if row["part"] == part])]
+    played = [(draw, own) for part, draw in parts.items() if (own := _of(ordered(rows), part=part))]
     if not played:
         return
     figure = Figure(figsize=(6.8 * len(played), 4.4), layout="constrained")
@@ -191,237 +259,131 @@ def draw_plan(file: Path, rows: Rows) -> None:
 
 def _draw_profiles(panel: Axes, base: Rows) -> None:
     """Draw the share of worlds below each map error, a line per policy."""
-    names = sorted({row["policy"] for row in base}, key=lambda name: float(_iqm(base, name, "map_error")))
-    for i, policy in enumerate(names):
-        worlds = [-own for own in by_family(_values(base, policy, "map_error"))]
+    for i, ((policy,), own) in enumerate(grouped(base, ("policy",)).items()):
+        share = performance_profile([-errors for errors in by_family(_values(own))], -THRESHOLDS)
         style = STYLES[i // len(COLOURS) % len(STYLES)]
-        share = performance_profile(worlds, -THRESHOLDS)
         panel.plot(THRESHOLDS, share, style, color=COLOURS[i % len(COLOURS)], label=label(policy), linewidth=1.3)
     panel.set(xlabel="map error E [m]", ylabel="share of worlds with a smaller error", title="base part")
 
 
 def _draw_team_sizes(panel: Axes, sizes: Rows) -> None:
     """Draw E over the number of robots, a line per number of particles."""
-    for i, ((particles,), group) in enumerate(sorted(grouped(sizes, ("particles",)).items())):
-        teams = sorted(grouped(group, ("robots",)).items())
-        middle, low, high = np.array([_ci(each, "map_error") for _, each in teams]).T
-        robots, colour = [count for (count,), _ in teams], COLOURS[i % len(COLOURS)]
-        panel.plot(robots, middle, "o-", color=colour, label=f"{particles} particles", markersize=3)
-        panel.fill_between(robots, low, high, color=colour, alpha=0.12, linewidth=0)
-    panel.set(xlabel="robots", ylabel="map error E [m]", title="team size and particles")
+    column = Column("map_error", "map error E [m]", _ci("map_error"))
+    chart = Chart(x="robots", label="robots", by="particles", panels=(Panel(column=column),))
+    draw_panel(panel, chart, chart.panels[0], sizes, sorted({row["particles"] for row in sizes}))
+    panel.set(xlabel="robots", title="team size, by number of particles")
     panel.set_xticks(sorted({row["robots"] for row in sizes}))
 
 
-# ------------------------------------------------------------------ tables
+# ------------------------------------------------------------------ columns
 
 
-def _overall(base: Rows, order: Sequence[str], first: str | None) -> Section:
-    """Return the main table: one row per policy over all worlds of the base part."""
-    columns: Sequence[tuple[str, str, int, float]] = (
-        ("E [cm]", "map_error", 1, CM), ("coverage over time [%]", "mean_coverage", 1, CM),
-        ("T50 [s]", "below_50_s", 0, 1.0),
-        ("T90 [s]", "below_90_s", 0, 1.0), ("recall [%]", "map_recall", 1, CM), ("ATE [cm]", "ate_start_m", 1, CM),
-        ("NEES", "nees", 1, 1.0),
-    )  # fmt: skip
-    lines = []
-    for policy in order:
-        played = [row for row in base if row["policy"] == policy]
-        cells = [_with_ends(_ci(played, name), digits, factor) for _, name, digits, factor in columns[:2]]
-        cells += [number(float(_iqm(base, policy, name)), digits, factor) for _, name, digits, factor in columns[2:]]
-        lines.append(
-            [label(policy), *cells, number(_mean(played, "decision_p99_ms"), 1), _improvement(base, policy, first)]
-        )
-    note = f"Interquartile means over {_worlds(base)} worlds, with 95 % intervals."
-    if first is not None:
-        note += f" P: probability that the map of a random world is better than one of `{first}`."
-    headings = ["all worlds", *(heading for heading, *_ in columns), "decision, p99 [ms]", "P"]
-    return Section("All worlds", note, headings, lines)
+def _column(heading: str, statistic: Statistic, digits: int = 1, factor: float = CM) -> Column:
+    return Column(heading, heading, statistic, digits, factor)
 
 
-def _families(base: Rows, order: Sequence[str], first: str | None) -> Section:
-    """Return E of each family, and the paired difference to the first policy."""
-    families = list(dict.fromkeys(row["family"] for row in base))
-    lines = []
-    for policy in order:
-        cells = []
-        for family in families:
-            own = _values([row for row in base if row["family"] == family], policy, "map_error")
-            other = _values([row for row in base if row["family"] == family], str(first), "map_error")
-            cells.append(number(float(np.mean(list(own.values()))), 1, CM) if own else "-")
-            if policy != first and own.keys() & other.keys():
-                cells[-1] += f", {_with_ends(_paired(own, other), 1, CM)}"
-        lines.append([label(policy), *cells])
-    note = f"Means of E [cm] and, behind the comma, paired differences to `{first}` with their 95 % intervals."
-    return Section("Families", note, ["E [cm]", *families], lines)
+def _e_column(heading: str, **where: Any) -> Column:
+    """Return the column of the interquartile mean of E with its interval, over the rows with some values."""
+    return _column(heading, _ci("map_error", **where))
 
 
-def _error_table(base: Rows, order: Sequence[str]) -> Section:
-    """Return what the squared map error consists of."""
-    lines = []
-    for policy in order:
-        played = [row for row in base if row["policy"] == policy]
-        parts = [_mean(played, f"squared_{name}") for name in PARTS_OF_E]
-        lines.append([
-            label(policy), *(number(part / sum(parts), 1, CM) for part in parts),
-            number(_mean(played, "map_rmse_m"), 1, CM), number(_mean(played, "map_precision"), 1, CM),
-        ])  # fmt: skip
-    note = "Shares of the mean of E^2 [%]; RMSE of the landmarks found, and the share of found ones that exist."
-    headings = ["parts of E^2 [%]", *PARTS_OF_E, "RMSE [cm]", "precision [%]"]
-    return Section("What the map error consists of", note, headings, lines)
+def _ci(name: str, **where: Any) -> Statistic:
+    """Return the interquartile mean of a metric with its interval; rows of several conditions are pooled."""
+
+    def statistic(rows: Rows) -> Estimate:
+        known = [row for row in _of(rows, **where) if row[name] is not None]
+        strata = [np.array([row[name] for row in own], float) for own in grouped(known, ("family",)).values()]
+        return _estimate(stratified_ci(strata, pooled(iqm))) if strata else Estimate(None)
+
+    return statistic
 
 
-def _merge_table(base: Rows, order: Sequence[str]) -> Section:
-    """Return merges, contacts and driving, per episode."""
-    reasons = sorted({reason for row in base for reason in row["refusals"]})
-    lines = []
-    for policy in order:
-        played = [row for row in base if row["policy"] == policy]
-        names = ("right_merges", "false_merges", "undone_merges", "last_merge_s")
-        refused = [sum(row["refusals"].get(reason, 0) for row in played) / len(played) for reason in reasons]
-        lines.append([
-            label(policy), *map(number, (_mean(played, name) for name in names), (2, 2, 2, 0)),
-            number(_mean(played, "overlap"), 0, CM), number(_mean(played, "way_m"), 0),
-            number(_mean(played, "balance"), 2),
-            number(_mean(played, "collisions"), 1, 0.1), number(_mean(played, "bytes_sent"), 0, 1e-3),
-            *(number(share, 1) for share in refused),
-        ])  # fmt: skip
-    headings = [
-        "per episode", "merged", "false", "undone", "last [s]", "overlap [%]", "path [m]", "balance", "collisions [s]",
-        "sent [kB]", *reasons,
-    ]  # fmt: skip
-    note = (
-        "Overlap: share of the seen floor that two robots have seen. Balance: shortest over longest path of a team. "
-        "The last columns count refused attempts by reason."
-    )
-    return Section("Merges and driving", note, headings, lines)
+def _iqm(name: str) -> Callable[[Rows], float | None]:
+    """Return the interquartile mean of a metric over all worlds, None if it is unknown in all."""
+
+    def statistic(rows: Rows) -> float | None:
+        found = list(_values(rows, name).values())
+        return float(iqm(np.array(found))) if found else None
+
+    return statistic
 
 
-def _profile_table(base: Rows, order: Sequence[str]) -> Section:
-    """Return the performance profile at a few map errors."""
-    limits = -np.array(PROFILE_CM) / CM
-    lines = []
-    for policy in order:
-        profile = performance_profile([-own for own in by_family(_values(base, policy, "map_error"))], limits)
-        lines.append([label(policy), *(number(float(share), 0, CM) for share in profile)])
-    headings = ["worlds [%]", *(f"E < {limit:g} cm" for limit in PROFILE_CM)]
-    return Section("Performance profile", "Share of the worlds with a smaller map error.", headings, lines)
+def _improvement(other: Rows, rows: Rows) -> Estimate:
+    """Return the probability that a map of a policy is better than one of the first policy, with its interval."""
+    own, first = (grouped(side, ("family",)) for side in (rows, other))
+    common = [family for family in own if family in first]
+    if not common or rows[0]["policy"] == other[0]["policy"]:
+        return Estimate(None)
+    xs, ys = ([-np.array(list(_values(side[family]).values())) for family in common] for side in (own, first))
+    return _estimate(probability_of_improvement(xs, ys))
 
 
-def _factors(plan: Plan, rows: Rows, order: Sequence[str]) -> Section:
-    """Return E where one factor differs from the base part."""
-    parts = plan.all_parts()
-    names = [name for name in FACTORS if name in parts and any(row["part"] == name for row in rows)]
-    lines = []
-    for policy in order:
-        own = [[row for row in rows if (row["part"], row["policy"]) == (name, policy)] for name in names]
-        if any(own):
-            lines.append([label(policy), *(_with_ends(_ci(each, "map_error"), 1, CM) if each else "-" for each in own)])
-    note = "Interquartile means of E [cm] with 95 % intervals; all else as in the base part."
-    return Section("One factor at a time", note, ["E [cm]", *(parts[name].title for name in names)], lines)
+def _in_family(family: str, other: Rows, rows: Rows) -> str:
+    """Return the mean E in a family, and the paired difference to the first policy."""
+    own, first = (_values(_of(side, family=family)) for side in (rows, other))
+    text = number(_mean(own.values()), 1, CM)
+    if not own.keys() & first.keys() or rows[0]["policy"] == other[0]["policy"]:
+        return text
+    return f"{text}, {_e_column('').text(_paired(own, first))}"
 
 
-def _ladder(rows: Rows, order: Sequence[str]) -> Section:
-    """Return how much of E each oracle removes, on the worlds of that part."""
-    lines = []
-    for policy in order:
-        told = [row for row in rows if (row["part"], row["policy"]) == (ORACLES, policy)]
-        by_oracle = {
-            oracle: _values(group, policy, "map_error") for (oracle,), group in grouped(told, ("oracle",)).items()
-        }
-        if "all" not in by_oracle:
-            continue
-        base = _values([row for row in rows if row["part"] == BASE_PART], policy, "map_error")
-        worlds = [world for world in by_oracle["all"] if world in base]
-        if not worlds:
-            continue
-        cells = [number(float(np.mean([base[world] for world in worlds])), 1, CM)]
-        cells += [
-            _with_ends(_paired(base, by_oracle[name]), 1, CM) if name in by_oracle else "-"
-            for name in ("pose", "association", "merge", "all")
-        ]
-        cells.append(number(float(np.mean([by_oracle["all"][world] for world in worlds])), 1, CM))
-        lines.append([label(policy), *cells])
-    note = (
-        "E [cm] without oracles; what knowing the poses, the landmarks' identities, the alignment of maps, and all "
-        "three takes off it, paired; and what is left with all: landmarks that exploration did not reach."
-    )
-    headings = ["E [cm]", "none", "localisation", "association", "merging", "all", "left: exploration"]
-    return Section("Oracle ladder", note, headings, lines)
+def _share_of_error(name: str, rows: Rows) -> float:
+    """Return the share of a part in the mean of the squared map error."""
+    parts = {part: _mean(row[f"squared_{part}"] for row in rows) or 0.0 for part in PARTS_OF_E}
+    return parts[name] / float(sum(parts.values()))
 
 
-def _team_sizes(rows: Rows) -> Section:
-    """Return E over the numbers of robots and particles."""
-    own = [row for row in rows if row["part"] == TEAM_SIZE]
-    robots = sorted({row["robots"] for row in own})
-    lines = [
-        [f"{particles} particles", *(
-            _with_ends(_ci([row for row in each if row["robots"] == count], "map_error"), 1, CM) for count in robots
-        )]
-        for (particles,), each in sorted(grouped(own, ("particles",)).items())
-    ]  # fmt: skip
-    note = f"Interquartile means of E [cm] of {_names(own)}: Fig. 6b of the paper, with robots that explore."
-    return Section("Team size and particles", note, ["E [cm]", *(f"K = {count}" for count in robots)], lines)
+def _refused(reason: str, rows: Rows) -> float:
+    """Return the number of attempts per episode that were refused for a reason."""
+    return float(np.mean([row["refusals"].get(reason, 0) for row in rows]))
+
+
+def _share_below(limit: float, rows: Rows) -> float:
+    """Return the share of worlds, the mean over families, with a smaller map error [m]."""
+    return float(performance_profile([-own for own in by_family(_values(rows))], np.array([-limit]))[0])
+
+
+def _with_all(part: str, rows: Rows) -> float | None:
+    """Return the mean E of a part over the worlds with all oracles that are in the base part."""
+    whole, base = _values(_of(rows, part=ORACLES, oracle="all")), _values(_of(rows, part=BASE_PART))
+    return _mean((base if part == BASE_PART else whole)[world] for world in whole if world in base)
+
+
+def _rung(oracle: str, rows: Rows) -> Estimate:
+    """Return what an oracle takes off E, paired over the worlds with it."""
+    return _paired(_values(_of(rows, part=BASE_PART)), _values(_of(rows, part=ORACLES, oracle=oracle)))
 
 
 # ------------------------------------------------------------------ values
 
 
-def _values(rows: Rows, policy: str, name: str) -> Values:
-    """Return a metric of a policy by family and seed, without unknown values."""
-    own = (row for row in rows if row["policy"] == policy and row[name] is not None)
-    return {(row["family"], row["seed"]): float(row[name]) for row in own}
+def _of(rows: Rows, **where: Any) -> Rows:
+    """Return the rows with some values."""
+    return [row for row in rows if all(row[name] == value for name, value in where.items())]
 
 
-def _iqm(rows: Rows, policy: str, name: str) -> FloatArray:
-    """Return the interquartile mean of a metric over all worlds, NaN if it is unknown in all."""
-    found = list(_values(rows, policy, name).values())
-    return iqm(np.array(found)) if found else np.array(np.nan)
+def _values(rows: Rows, name: str = "map_error") -> Values:
+    """Return a metric of the rows of a policy by family and seed, without unknown values."""
+    return {(row["family"], row["seed"]): float(row[name]) for row in rows if row[name] is not None}
 
 
-def _mean(rows: Rows, name: str) -> float:
-    """Return the mean of the known values of a metric, NaN if there are none."""
-    found = [row[name] for row in rows if row[name] is not None]
-    return float(np.mean(found)) if found else float("nan")
+def _mean(values: Iterable[float]) -> float | None:
+    known = list(values)
+    return float(np.mean(known)) if known else None
 
 
-def _ci(rows: Rows, name: str) -> tuple[float, float, float]:
-    """Return the interquartile mean of a metric with its interval; rows of several conditions are pooled."""
-    families = grouped([row for row in rows if row[name] is not None], ("family",)).values()
-    return stratified_ci([np.array([row[name] for row in own], float) for own in families], pooled(iqm))
-
-
-def _paired(own: Values, other: Values) -> tuple[float, float, float]:
+def _paired(own: Values, other: Values) -> Estimate:
     """Return the mean difference on common worlds with its interval."""
-    worlds = [world for world in own if world in other]
-    return stratified_ci(by_family({world: own[world] - other[world] for world in worlds}), pooled(_average))
+    apart = {world: own[world] - other[world] for world in own if world in other}
+    return _estimate(stratified_ci(by_family(apart), pooled(_average))) if apart else Estimate(None)
 
 
 def _average(values: FloatArray) -> FloatArray:
     return np.asarray(values.mean(axis=-1))
 
 
-def _improvement(base: Rows, policy: str, first: str | None) -> str:
-    """Return the probability that a map of a policy is better than one of the first policy, with its interval."""
-    if policy == first or first is None:
-        return "-"
-    own, other = (_values(base, name, "map_error") for name in (policy, first))
-    families = [family for family in dict.fromkeys(f for f, _ in own) if any(f == family for f, _ in other)]
-    if not families:
-        return "-"
-    xs, ys = (
-        [-np.array([v for (f, _), v in side.items() if f == family]) for family in families] for side in (own, other)
-    )
-    return _with_ends(probability_of_improvement(xs, ys), 2, 1.0)
-
-
-def _with_ends(value: tuple[float, float, float], digits: int, factor: float) -> str:
-    """Format a value with its interval."""
-    middle, low, high = (number(each, digits, factor) for each in value)
-    return middle if low == "-" else f"{middle} ({low} .. {high})"
-
-
-def _worlds(rows: Rows) -> int:
-    return len({(row["family"], row["seed"]) for row in rows})
+def _estimate(found: tuple[float, float, float]) -> Estimate:
+    return Estimate(found[0]) if np.isnan(found[1]) else Estimate(*found)
 
 
 def _names(rows: Rows) -> str:

@@ -1,16 +1,22 @@
 """Policies of the exploration benchmark: of each robot, of the team, and bounds, by their names on the command line."""
 
 import hashlib
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from agents.bounds import BOUNDS, make_bound
 from agents.plugins import is_plugin, plugin_file
 from agents.policy import keys_for
 from agents.registry import action_types, make_policy, make_team_policy, model_file
+from agents.trained import MODEL_FILE
 from slam_backend.core.validation import check_choice
+from training.bench.exploration.config import ALL_ORACLES, ANY_SPLIT, ORACLES
+from training.episodes.config import RunConfig
 from training.episodes.guard import GuardedTeam
 from training.experiments.policy_names import parted_label
+from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
+from vslam_env.world import is_single_layout
 
 ROBOT, TEAM, BOUND = "robot", "team", "bound"
 BASE = "frontier"  # base policy of the bounds
@@ -66,6 +72,47 @@ class Player(NamedTuple):
             return GuardedTeam(make_team_policy(self.name, self.action_type), self.label, self.action_type, limit)
         policies = {agent: make_policy(self.name, self.action_type) for agent in env.possible_agents}
         return GuardedTeam(policies, self.label, self.action_type, limit)
+
+
+def environment_of(trial: Any, world: str, split: str, duration: float, **run: Any) -> EnvConfig:
+    """Return the environment of an episode of a policy.
+
+    Args:
+        trial: Trial with `policy`, `robots`, `oracle` and `seed`.
+        world: World family or path.
+        split: Split of worlds, or `ANY_SPLIT`.
+        duration: Simulated time [s].
+        run: More fields of `RunConfig`.
+    """
+    player = parted(trial.policy)
+    config = RunConfig(
+        world=world, robots=trial.robots, policy=player.policy, action_type=player.action_type,  # type: ignore[arg-type]
+        seed=trial.seed, max_seconds=duration, **run,
+    ).environment()  # fmt: skip
+    has_all = trial.oracle == ALL_ORACLES or player.needs_oracles
+    oracles = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}
+    return config.replace(world_split=world_split(split, world), **oracles)
+
+
+def world_split(split: str, world: str) -> str | None:
+    """Return the split of an environment, None where a world is not drawn or any will do."""
+    return None if split == ANY_SPLIT or is_single_layout(world) else split
+
+
+def label(name: str) -> str:
+    """Return the label of a policy or a world for tables and figures: a path is given without its folders.
+
+    >>> label("runs/train-0-1"), label("runs/train-0-1/model.npz"), label("mine=look_again:LookAgain@discrete")
+    ('train-0-1', 'train-0-1/model.npz', 'mine@discrete')
+    """
+    given, policy = parted_label(name)
+    if given:
+        _, at, suffix = policy.rpartition("@")
+        return f"{given}{at}{suffix}" if at else given
+    path = Path(name)
+    if is_plugin(name):
+        return name
+    return f"{path.parent.name}/{path.name}" if path.name == MODEL_FILE else path.name
 
 
 def parted(label: str) -> Player:

@@ -2,9 +2,10 @@
 
 import json
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,7 +16,7 @@ from slam_backend.core.validation import BoolArray, FloatArray, argument_error
 from slam_backend.geometry import compose
 from slam_backend.metrics import MapErrorParts, map_error_parts
 from training.bench.exploration.machine import machine
-from training.bench.exploration.players import parted
+from training.bench.exploration.players import BOUND, Player, parted
 from training.episodes.digest import episode_digest
 from training.episodes.guard import PolicyError
 from training.episodes.metrics import score_episode
@@ -106,6 +107,27 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
         },
         "digest": episode_digest(record), "policy_digest": player.source_digest(), "machine": machine(),
     }  # fmt: skip
+
+
+def first_steps(environment: EnvConfig, player: Player, seed: int, decision_limit: float) -> None:
+    """Run the first two steps of an episode, to detect worlds that cannot be built, and compile what its policy needs.
+
+    The trial itself reports a policy that fails.
+    """
+    steps = iter(range(2))
+    if player.role == BOUND:
+        return
+    env = vslam_v1.parallel_env(config=environment)
+    with suppress(PolicyError):
+        team = player.make(env, decision_limit)
+        run_episode(env, team, seed, should_stop=lambda: next(steps, None) is None)
+    env.close()
+
+
+def checks(bench: Bench, trials: Sequence[Any]) -> list[Callable[[], None]]:
+    """Return the first steps of each policy, world family and number of robots."""
+    firsts = {(t.policy, getattr(t, "family", t.world), t.robots): t for t in reversed(trials)}.values()
+    return [partial(first_steps, bench.environment(t), parted(t.policy), t.seed, bench.decision_limit) for t in firsts]
 
 
 def check_same_policies(out: Path | None, policies: Collection[str]) -> None:

@@ -4,6 +4,7 @@ import datetime
 import json
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,13 @@ import numpy as np
 
 from slam_backend.core.files import append_text
 from slam_backend.core.text_files import read_text
-from training.bench.exploration.report import label
-from training.experiments.statistics import format_ci, grouped, mean_ci
+from training.bench.exploration.players import label
+from training.experiments.statistics import grouped
+from training.experiments.study import Column, ResultTable
 
 VERIFIED_FILE = "verified.jsonl"
 Rows = Sequence[Mapping[str, Any]]
 OUTCOMES = ("all bits equal", "all numbers equal", "different")
-HEADINGS = ("policy", "played again", *OUTCOMES, "E [cm], again minus stored")
 CLOSE = 1e-4  # relative difference up to which numbers count as equal where last bits may differ
 CLOSE_TO_ZERO = 1e-7  # absolute one
 NOT_COMPARED = ("digest", "policy_digest", "machine", "decision_ms", "decision_p99_ms", "curves")
@@ -44,6 +45,7 @@ def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, An
         "is_other_policy": (stored["policy_digest"] or "") != again["policy_digest"],
         "digest": stored["digest"], "again": again["digest"], "machine": again["machine"],
         "stored_on": stored["machine"], "map_error": stored["map_error"], "map_error_again": again["map_error"],
+        "more": again["map_error"] - stored["map_error"],
     }  # fmt: skip
 
 
@@ -57,16 +59,6 @@ def outcome_counts(comparisons: Rows) -> list[int]:
     """Return the numbers of comparisons with each of `OUTCOMES`: the second is found where last bits may differ."""
     outcomes = [OUTCOMES[_outcome(row)] for row in comparisons]
     return [outcomes.count(outcome) for outcome in OUTCOMES]
-
-
-def table_rows(comparisons: Rows) -> list[list[str]]:
-    """Return the cells of a table of `HEADINGS`, a row per policy."""
-    lines = []
-    for (policy,), group in grouped(comparisons, ("policy",)).items():
-        counts = outcome_counts(group)
-        more = [row["map_error_again"] - row["map_error"] for row in group]
-        lines.append([label(policy), str(len(group)), *map(str, counts), format_ci(mean_ci("E", more), "E", 2, 100.0)])
-    return lines
 
 
 def last_outcomes(folder: Path) -> dict[str, list[int]]:
@@ -93,3 +85,17 @@ def _close(stored: Any, again: Any) -> bool:
     if isinstance(stored, (int, float)) and isinstance(again, (int, float)):
         return math.isclose(stored, again, rel_tol=CLOSE, abs_tol=CLOSE_TO_ZERO)
     return bool(stored == again)
+
+
+def _count(outcome: int, comparisons: Rows) -> int:
+    return outcome_counts(comparisons)[outcome]
+
+
+TABLE = ResultTable(
+    name="verified", title="Episodes played again", by=("policy",), words={"policy": ("policy", label)},
+    columns=(
+        Column("episodes", "played again", len, digits=0),
+        *(Column(name, "", partial(_count, i), digits=0) for i, name in enumerate(OUTCOMES)),
+        Column("more", "E [cm], again minus stored", digits=2, factor=100.0, interval=True),
+    ),
+)  # fmt: skip

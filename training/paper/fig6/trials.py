@@ -1,7 +1,8 @@
 """Trials of the paper's Fig. 6 in three noise regimes: map error and step time of a filter."""
 
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -9,7 +10,9 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, check_choice, check_int
 from slam_backend.fastslam.filter import FastSlam
+from training.experiments.study import Row
 from training.experiments.timing import no_garbage_collection
+from training.paper.config import Fig6Config
 from training.stereo_runs.runs import FALSE_POINT, Preset, RunSpec, StereoRun, simulate_run
 from training.stereo_runs.scores import (
     REJUVENATE_EVERY,
@@ -34,9 +37,6 @@ FILTER_OPTIONS: dict[Proposal, dict[str, Any]] = {
 
 # Sec. 5 mentions neither similar landmarks nor false points.
 DISTINCT = {"look_alikes": 1, "outliers": 0.0, "wrong_descriptors": 0.0}
-ERRORS_FILE, TIMES_FILE = "errors.jsonl", "times.jsonl"
-FIXED_COST = 200  # fixed cost of a step, in particles
-BOUND_COST = 4000  # cost of batch maximum likelihood, in the same unit
 BLOCK = 20  # steps of one filter before the next filter runs
 FIGURES = (
     "map_rmse_m", "map_aligned_rmse_m", "map_all_rmse_m", "map_recall", "map_precision", "pose_rms_m",
@@ -77,76 +77,63 @@ REGIMES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorTrial:
-    """Parameters of a map error trial."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """A filter whose map error is measured, or several whose steps are timed together."""
 
-    regime: str  # Key of `REGIMES`
-    proposal: Proposal  # Proposal of the filter, or `BOUND`
-    robots: int  # K
+    regime: str = "paper"  # Key of `REGIMES`
+    proposal: Proposal = "fastslam1"  # Proposal of the filter, or `BOUND`
+    robots: tuple[int, ...]  # Number K, or all numbers that are timed together
     particles: int  # M; 0 for the bound
     measurements: int  # B, for all robots together
     length: float  # Path length of each robot [m]
-    seed: int  # Seed of the run and of the filter
+    seed: int  # Seed of the runs and of the filters
+    is_timed: bool = False  # Whether steps are timed
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "robots", tuple(self.robots))
         check_choice("regime", self.regime, tuple(REGIMES))
         check_choice("proposal", self.proposal, REGIMES[self.regime].proposals)
         least = 0 if self.proposal == BOUND else 1
         check_int("particles", self.particles, least, "Use at least one particle; 100 is a good start.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-        _ = self.spec  # validates the other fields
-
-    @property
-    def spec(self) -> RunSpec:
-        """Simulated run."""
-        return REGIMES[self.regime].spec(self.robots, self.length, self.measurements)
-
-
-@dataclass(frozen=True, slots=True)
-class TimeTrial:
-    """Parameters of a step time trial; all numbers of robots are timed together."""
-
-    robots: tuple[int, ...]  # Numbers K
-    particles: int  # M
-    measurements: int  # B, for all robots together
-    length: float  # Path length of each robot [m]
-    seed: int  # Seed of the runs and of the filters
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "robots", tuple(self.robots))
-        for robots in self.robots:
-            ErrorTrial("paper", "fastslam1", robots, self.particles, self.measurements, self.length, self.seed)
+        _ = self.specs  # validates the other fields
 
     @property
     def specs(self) -> list[RunSpec]:
         """Simulated runs, one for each number of robots."""
-        return [REGIMES["paper"].spec(robots, self.length, self.measurements) for robots in self.robots]
+        return [REGIMES[self.regime].spec(robots, self.length, self.measurements) for robots in self.robots]
 
 
-def cost(trial: ErrorTrial | TimeTrial) -> int:
-    """Return the approximate cost of a trial in an arbitrary unit, for a progress bar."""
-    if isinstance(trial, TimeTrial):
-        return (trial.particles + FIXED_COST) * len(trial.robots)
-    return BOUND_COST if trial.proposal == BOUND else trial.particles + FIXED_COST
-
-
-def play_error(trial: ErrorTrial) -> dict[str, Any]:
-    """Run a trial.
+def play(config: Fig6Config, trial: Trial) -> dict[str, Any]:
+    """Run a trial; lists have a value for each number of robots.
 
     Returns:
-        Fields of the trial, metrics of `score`, and `map_all_rmse_m`: the RMSE over all landmarks of
-        the map that have a true landmark, duplicates included, while `map_rmse_m` uses the nearest one.
+        The times of `play_times`, or `FIGURES`: the metrics of `score`, and `map_all_rmse_m`, the RMSE over all
+        landmarks of the map that have a true landmark, duplicates included, while `map_rmse_m` uses the nearest one.
         Metrics that only filters have are NaN for the bound.
     """
-    run = _run_of(trial.spec, trial.seed)
+    runs = [_run_of(spec, trial.seed) for spec in trial.specs]
+    if trial.is_timed:
+        return play_times(runs, trial)
+    (run,) = runs
     if trial.proposal == BOUND:
         problem, batch = batch_of(run)
         answer = least_squares_answer(problem, batch.paths, batch.path_covariances, batch.landmarks)
     else:
         answer = follow(run, _build(run, trial.proposal, trial.particles, trial.seed))
     row = score(run, answer) | {"map_all_rmse_m": rms_of_all(run, answer)}
-    return asdict(trial) | {name: row[name] for name in FIGURES}
+    return {name: row[name] for name in FIGURES}
+
+
+def unfold(rows: Sequence[Row]) -> list[Row]:
+    """Return a row for each number of robots of a trial, with the title of its `filter`."""
+    return [
+        {"filter": f"{REGIMES[row['regime']].title}, {row['proposal']}"}
+        | {name: value[i] if isinstance(value, list | tuple) else value for name, value in row.items()}
+        for row in rows
+        for i in range(len(row["robots"]))
+    ]
 
 
 def rms_of_all(run: StereoRun, answer: Answer) -> float:
@@ -158,26 +145,23 @@ def rms_of_all(run: StereoRun, answer: Answer) -> float:
     return float(np.sqrt((apart**2).sum(axis=1).mean())) if caused.any() else float("nan")
 
 
-def play_time(trial: TimeTrial) -> dict[str, Any]:
-    """Time the filters of all numbers of robots in the paper's regime, interleaved so that other load affects all.
+def play_times(runs: list[StereoRun], trial: Trial) -> dict[str, list[float]]:
+    """Time the filters of all numbers of robots, interleaved so that other load affects all.
 
     Returns:
-        Fields of the trial, and for each number of robots: `median_ms` over the steps with the full number of
-        measurements, `all_median_ms` and `all_mean_ms` over all steps, and `measured`, the mean number per step.
-        Times are processor times of the single thread of a filter; other processes affect them only through shared
-        caches.
+        Lists with a value for each number of robots: `median_ms` over the steps with the full number of measurements,
+        `all_median_ms` and `all_mean_ms` over all steps, and `measured`, the mean number per step. Times are processor
+        times of the single thread of a filter; other processes affect them only through shared caches.
     """
-    runs = [_run_of(spec, trial.seed) for spec in trial.specs]
-    filters = [_build(run, "fastslam1", trial.particles, trial.seed) for run in runs]
-    times = time_in_turns(filters, runs)
+    filters = [_build(run, trial.proposal, trial.particles, trial.seed) for run in runs]
     columns: dict[str, list[float]] = {"median_ms": [], "all_median_ms": [], "all_mean_ms": [], "measured": []}
-    for run, own in zip(runs, times, strict=True):
+    for run, own in zip(runs, time_in_turns(filters, runs), strict=True):
         full = full_steps(run)
         columns["median_ms"].append(float(np.median(own[full])) if full.any() else float("nan"))
         columns["all_median_ms"].append(float(np.median(own)))
         columns["all_mean_ms"].append(float(own.mean()))
         columns["measured"].append(float(_measured(run).mean()))
-    return asdict(trial) | columns
+    return columns
 
 
 def time_in_turns(filters: list[FastSlam], runs: list[StereoRun]) -> list[FloatArray]:

@@ -19,6 +19,7 @@ from vslam_env.simulation.scenario import sample_scenario
 from vslam_env.world import Simulator, read_odometry
 
 PEER = "mpe2"  # package of simple_spread, the comparison
+SNAPSHOTS = ("get_state", "set_state, same episode", "set_state, another seed", "clone")
 BURST = 50  # consecutive calls of one play before the next
 
 
@@ -137,12 +138,11 @@ def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> 
     other.reset(seed=seed + 1)
     states = [other.get_state(), state]
     some: list[int] = list(range(repeats))
-    return {
-        "get_state": _timed(lambda _: env.get_state(), some, 1),
-        "set_state, same episode": _timed(lambda _: env.set_state(state), some, 1),
-        "set_state, another seed": _timed(lambda i: other.set_state(states[i % 2]), some, 2),
-        "clone": _timed(lambda _: env.clone(), some, 1),
-    }
+    times = (
+        _timed(lambda _: env.get_state(), some, 1), _timed(lambda _: env.set_state(state), some, 1),
+        _timed(lambda i: other.set_state(states[i % 2]), some, 2), _timed(lambda _: env.clone(), some, 1),
+    )  # fmt: skip
+    return dict(zip(SNAPSHOTS, times, strict=True))
 
 
 def play_peer(agents: int, seed: int, steps: int) -> Play | None:

@@ -1,29 +1,27 @@
-"""`vslam bench start`: how long a user waits at first, with empty caches and an empty home, on two cores."""
+"""Study of `vslam bench speed start`: the time until a user can work, with empty caches and home, on two cores."""
 
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
-from slam_backend.core.validation import argument_error
-from training.bench.config import StartBenchConfig
-from training.experiments.tables import console_table, markdown_table, number
-from training.experiments.timing import describe_machine, print_caveats, run_named_trials
+from training.bench.speed.config import Part, StartSpeedConfig
+from training.experiments.study import Column, ResultTable, Row, Study
+from training.experiments.tables import number
 
 CORES = 2
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
 MANY_PARAMETERS = 10
-HEADINGS = ("part", "median", "least", "most", "runs", "goal")
 SETTINGS = ("NUMBA_", "PYTHON", "XDG_", "MPL")  # what variables of the user begin with that change what is timed
 DEMO = ("run", "--world", "office", "--robots", "3", "--policy", "frontier", "--seed", "0")
 # Programs print their figures on the last line.
@@ -73,17 +71,26 @@ class Figure:
     """A figure of one part.
 
     Attributes:
-        part: Part of the start-up that is measured.
+        name: Name of what is measured.
         unit: Unit; empty for a count or a ratio.
         goal: Upper limit to reach; None: no limit.
     """
 
-    part: str
+    name: str
     unit: str = "s"
     goal: float | None = None
 
 
-FIGURES: dict[str, tuple[Figure, ...]] = {
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One figure of one run of a part."""
+
+    part: Part
+    figure: str  # Name of the figure
+    run: int  # Number of the run
+
+
+FIGURES: dict[Part, tuple[Figure, ...]] = {
     "demo": (Figure("make demo from a fresh clone, after installation"),),
     "kernels": (Figure("all kernels, one worker", goal=65.0), Figure("all kernels, two workers", goal=36.0)),
     "steps": (Figure("first reset and 10 steps of the default environment", goal=30.0),),
@@ -98,35 +105,33 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
 }  # fmt: skip
 
 
-def run_bench(
-    config: StartBenchConfig,
-    on_trial: Callable[[str], None] = lambda name: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> dict[str, Any]:
-    """Time each part in processes of their own, as often as asked for.
-
-    Returns:
-        `figures`: rows with part, unit, goal, values; `machine`, `complete`.
-    """
-    measure: dict[str, Callable[[], tuple[float, ...]]] = {
-        "demo": demo, "kernels": lambda: (*kernels(1), *kernels(2)), "steps": first_steps,
-        "wheel": lambda: first_picture(Path(str(config.wheel))), "import": imports, "count": count,
-    }  # fmt: skip
-    values: dict[str, list[tuple[float, ...]]] = {part: [] for part in config.parts}
-    result: dict[str, Any] = {"machine": describe_machine()}
-
-    def trial(part: str) -> Callable[[], None]:
-        return lambda: values[part].append(measure[part]())
-
-    trials = [(part, trial(part)) for _ in range(config.repeats) for part in config.parts]
-    with on_two_cores():
-        result["complete"] = run_named_trials(trials, on_trial, should_stop)
-    rows = [
-        {"part": figure.part, "unit": figure.unit, "goal": figure.goal, "values": [run[i] for run in values[part]]}
-        for part in config.parts
-        for i, figure in enumerate(FIGURES[part])
+def trials(config: StartSpeedConfig) -> list[Trial]:
+    """Return all trials, run by run."""
+    wheel: tuple[Part, ...] = ("wheel",) if config.wheel is not None and "wheel" not in config.parts else ()
+    return [
+        Trial(part=part, figure=figure.name, run=run)
+        for run in range(config.repeats)
+        for part in (*config.parts, *wheel)
+        for figure in FIGURES[part]
     ]
-    return result | {"figures": rows}
+
+
+def play(config: StartSpeedConfig, trial: Trial) -> dict[str, Any]:
+    """Time a part in processes of its own, once for all its figures; return the `value` of one."""
+    values = measured(trial.part, trial.run, config.wheel)
+    names = [figure.name for figure in FIGURES[trial.part]]
+    return {"value": values[names.index(trial.figure)]}
+
+
+@lru_cache(maxsize=1)
+def measured(part: Part, run: int, wheel: str | None) -> tuple[float, ...]:
+    """Return the values of all figures of a part in a run."""
+    measure: dict[Part, Callable[[], tuple[float, ...]]] = {
+        "demo": demo, "kernels": lambda: (*kernels(1), *kernels(2)), "steps": first_steps,
+        "wheel": lambda: first_picture(Path(str(wheel))), "import": imports, "count": count,
+    }  # fmt: skip
+    with on_two_cores():
+        return measure[part]()
 
 
 # ---------------------------------------------------------------------- what is timed
@@ -236,36 +241,41 @@ def on_two_cores() -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def check_wheel(config: StartBenchConfig) -> None:
-    """Refuse to time a wheel that is not there.
-
-    Raises:
-        ValueError: If the part `wheel` is asked for and there is no such file.
-    """
-    if "wheel" in config.parts and (config.wheel is None or not Path(config.wheel).is_file()):
-        expected = "the wheel that `make kernels-wheel` writes"
-        raise argument_error("wheel", expected, config.wheel, "Or leave the part wheel out.")
+# ---------------------------------------------------------------------- results
 
 
-# ---------------------------------------------------------------------- tables
+def _figure(rows: Sequence[Row]) -> Figure:
+    """Return the figure of a line."""
+    return next(figure for figure in FIGURES[rows[0]["part"]] if figure.name == rows[0]["figure"])
 
 
-def cells(figure: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a row of the table."""
-    values, unit = figure["values"], f" {figure['unit']}" if figure["unit"] else ""
+def _shown(statistic: Callable[[Sequence[float]], Any], rows: Sequence[Row]) -> str:
+    """Return a statistic of the values with its unit."""
+    values = [row["value"] for row in rows]
     digits = 0 if all(float(value).is_integer() for value in values) else 2
-    goal = "" if figure["goal"] is None else f"{figure['goal']:g}{unit}"
-    shown = [number(f(values) if values else None, digits) + unit for f in (np.median, min, max)]
-    return (figure["part"], *shown, str(len(values)), goal)
+    return f"{number(float(statistic(values)), digits)} {_figure(rows).unit}".rstrip()
 
 
-def markdown(result: Mapping[str, Any]) -> str:
-    """Return the table as Markdown."""
-    return markdown_table(HEADINGS, [cells(figure) for figure in result["figures"]])
+def _goal(rows: Sequence[Row]) -> str:
+    figure = _figure(rows)
+    return "" if figure.goal is None else f"{figure.goal:g} {figure.unit}".rstrip()
 
 
-def print_result(console: Console, result: Mapping[str, Any]) -> None:
-    """Print the table."""
-    title = f"Start-up with empty caches and home, {CORES} cores, {result['machine']['processor']}"
-    console.print(console_table(title, HEADINGS, [cells(figure) for figure in result["figures"]]))
-    print_caveats(console, result)
+STUDY = Study(
+    name="start",
+    config=StartSpeedConfig,
+    trial=Trial,
+    trials=trials,
+    play=play,
+    timed=True,
+    tables=(
+        ResultTable(
+            name="start", title=f"Start-up with empty caches and home, {CORES} cores", by=("part", "figure"),
+            columns=(
+                Column("median", statistic=partial(_shown, np.median)), Column("least", statistic=partial(_shown, min)),
+                Column("most", statistic=partial(_shown, max)), Column("runs", statistic=len, digits=0),
+                Column("goal", statistic=_goal),
+            ),
+        ),
+    ),
+)  # fmt: skip

@@ -1,1 +1,0 @@
-"""Environment benchmark: speed of `env.step` and its breakdown by part."""

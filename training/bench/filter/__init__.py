@@ -1,1 +1,0 @@
-"""Filter benchmark: speed of a filter step."""

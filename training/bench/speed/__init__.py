@@ -1,0 +1,1 @@
+"""Speed of a filter step, of `env.step`, and of the start-up."""
