@@ -45,7 +45,7 @@ COMMANDS = {
         "warm_up", "warm_up", "Compile the kernels into the disk cache; takes seconds if they are cached already.",
     ),
     "replay": ("replay", "replay", "Run the backend on logs of real robots."),
-    "bench": ("bench", "bench", "Measure accuracy and speed of filters, environments and training."),
+    "bench": ("bench", "bench", "Compare policies, and measure the speed of filters and environments."),
     "paper": ("paper", "paper", "Reproduce figures of the paper."),
     "worlds": ("worlds", "worlds", "List, preview, check and import worlds."),
 }  # fmt: skip

@@ -155,9 +155,13 @@ def test_every_command_has_bad_arguments() -> None:
 
 @pytest.mark.parametrize("command", [name for name, each in COMMANDS.items() if each.hidden])
 def test_moved_commands_name_programs(command: str, refusal: Any) -> None:
-    """Whatever options they are given, one line names the programs in a clone, which exist."""
-    said = refusal(*command.split(), "--worlds", "office")
-    beginning = f"error bench: expected another command, got '{command.split()[1]}'. In a clone: python -m "
+    """Whatever options they are given, one line names the programs in a clone, or the command, which exist."""
+    said, name = refusal(*command.split(), "--worlds", "office"), command.split()[1]
+    beginning = f"error bench: expected another command, got {name!r}. "
+    if f"bench speed {name}" in COMMANDS:
+        assert said.rstrip() == f"{beginning}Use vslam bench speed {name}."
+        return
+    beginning += "In a clone: python -m "
     assert said.startswith(beginning)
     for program in said.removeprefix(beginning).rstrip().rstrip(".").split(" or "):
         assert find_spec(program) is not None
