@@ -42,10 +42,10 @@ HINTS: dict[str, str] = {  # hints by refusal reason
     "mirrored": "The mirror image fits better: check the sign of the measured coordinates.",
     "poorly spread": "The shared landmarks are too close together: let robots see more of the same places.",
     "too uncertain": "The path of a robot to the shared landmarks is too uncertain: close loops or set"
-    " `rejuvenate_every`; or accept it, with a lower `MergeOptions.least_sigmas` if the paths are uncertain, or"
+    " `rejuvenate_every`; or accept it, with a lower `MergeOptions.min_sigmas` if the paths are uncertain, or"
     " a higher `AlignmentOptions.max_sigma_position` or `max_sigma_heading` if the landmarks are.",
 }
-BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # possible bounds of a "too uncertain" refusal
+BOUNDS = ("translation", "rotation", "one match", "paths")  # possible bounds of a "too uncertain" refusal
 DISTINCT_TRANSLATION = 0.5  # [m]; alignments beyond these two limits count as different, and as false
 DISTINCT_ROTATION = math.radians(5.0)
 LARGEST = 1e9  # limit of gates and distances; their squares do not overflow

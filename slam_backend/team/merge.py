@@ -47,7 +47,6 @@ from slam_backend.team.merge_attempt import (
     map_numbers,
     mixture_maps,
     pairs_of,
-    refused_if_uncertain,
     representatives,
 )
 from slam_backend.team.merge_monitor import are_both_connected
@@ -77,7 +76,7 @@ class MergeProcess:
     | undoing | The joint filter goes on. The filters from before the merge replay the inputs since then, 20 steps at a time. | they have caught up, and all sides are in contact | undone |
     | | | the group merges again, or a fork without the monitor replaces its filter | watched |
     | undone | The separate filters go on. Forks that split from the joint one still know its map. | the last of these forks returns | final |
-    | refused | The pair waits for 25 to 200 steps. | | |
+    | refused | The pair waits for 25 steps or more. | | |
     | abandoned | The pair may try again at once. | | |
     | final | Nothing is left of what it takes to undo the merge. | | |
 
@@ -182,20 +181,19 @@ class Trial:
 
     def advance(self, team: "TeamMerges") -> "Phase":
         """Merge the groups if the motion is known well enough."""
-        merging, plan, alignment = team.merging, self.plan, self.plan.alignment
-        uncertainty, pairing, before = float("nan"), None, team.rng.bit_generator.state
+        merging, plan, pairing = team.merging, self.plan, None
+        uncertainty, before = float("nan"), team.rng.bit_generator.state
+        alignment, key = plan.alignment, key_of(plan.groups)
         if alignment.success and merging.min_sigmas:
             start = plan.relative_start()
             if start is None:
                 pairing = plan.pair_particles(merging, team.rng)
-                motion, relative = plan, transform_uncertainty(plan, pairing)
+                relative = transform_uncertainty(plan, pairing)
             else:
-                motion, relative = plan.with_motion(start), relative_uncertainty(start.covariance)
-            uncertainty = merging.min_sigmas * relative
-            plan = motion if uncertainty <= merging.trusted_uncertainty else plan
-            change = team.schedule.change(key_of(plan.groups), motion.alignment.transform)
-            alignment = refused_if_uncertain(plan.alignment, plan.groups, uncertainty, change, team.schedule, merging)
-        key = key_of(plan.groups)
+                plan, relative = plan.with_motion(start), relative_uncertainty(start.covariance)
+            alignment, uncertainty = plan.alignment, merging.min_sigmas * relative
+            if team.schedule.should_defer(key, uncertainty):
+                alignment = Alignment.refused("too uncertain", alignment.ratio, "paths", uncertainty)
         team.schedule.record(key, team.step, alignment.success, self.unsmoothed is not None)
         team.events.append(MergeEvent(team.step, "attempt", *key, alignment, self.unsmoothed, uncertainty))
         if not alignment.success:

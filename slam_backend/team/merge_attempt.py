@@ -10,7 +10,6 @@ from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_scheduler import MergeScheduler, PairKey
-from slam_backend.team.options import MergeOptions
 
 MIN_REMAINING_INLIERS = 0.8  # least share of the inliers before smoothing that must remain after it
 
@@ -48,22 +47,6 @@ def align_smoothed(
     fewer = alignment.success and len(alignment.inliers) < MIN_REMAINING_INLIERS * len(unsmoothed.inliers)
     if fewer or alignment.reason == "too few inliers":
         return Alignment.refused("too few inliers", alignment.ratio)
-    return alignment
-
-
-def refused_if_uncertain(
-    alignment: Alignment,
-    pair: GroupPair,
-    uncertainty: float,
-    change: float,
-    schedule: MergeScheduler,
-    merging: MergeOptions,
-) -> Alignment:
-    """Return an alignment, or its refusal if its uncertainty, or its change since the last one, exceeds the limits."""
-    if schedule.should_defer(key_of(pair), uncertainty, merging.max_uncertainty):
-        return Alignment.refused("too uncertain", alignment.ratio, "paths", uncertainty)
-    if uncertainty > 1.0 and merging.least_sigmas and change > 1.0:
-        return Alignment.refused("too uncertain", alignment.ratio, "repeat", change)
     return alignment
 
 

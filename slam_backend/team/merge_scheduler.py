@@ -4,21 +4,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from slam_backend.core.read_only import as_constant
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.validation import MOST, FloatArray, argument_error, check_int, known_names
-from slam_backend.geometry import wrap_angle
-from slam_backend.maps.alignment import (
-    DISTINCT_ROTATION,
-    DISTINCT_TRANSLATION,
-    AlignmentOptions,
-)
+from slam_backend.core.validation import MOST, argument_error, check_int, known_names
+from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.maps.correspondences import candidates, too_many
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.state import (
-    FLOAT64,
     MAX_LANDMARKS,
-    Array,
     Dict,
     Each,
     Float,
@@ -48,8 +40,8 @@ class AttemptOptions:
         new_candidates: Least number of new candidate matches for another attempt of a refused pair, unless the last one
             is more than `longest_wait` steps ago: by then the same landmarks are known better. A pair whose maps
             aligned, but not after smoothing, needs no new ones.
-        longest_wait: Limit of the wait after a refusal, which doubles with each one [steps]; the wait is longer after
-            smoothing of the logs (`MergeScheduler.record`).
+        longest_wait: Longest wait after a refusal [steps]. It is `every` or, after smoothing of the logs, until an
+            eighth of them is new.
         enabled: Whether any pair tries at all.
     """
 
@@ -70,14 +62,12 @@ class AttemptRecord:
     """Past attempts of one pair of groups.
 
     Attributes:
-        wait: Least wait after the next refusal [steps].
         last_step: Step of the last attempt.
         next_step: Step from which the pair may try again.
         tried: Candidate matches of the last attempt, by landmark ids.
     """
 
-    STATE = State(wait=Int(), last_step=Int(), next_step=Int(), tried=Each(Row(LANDMARK, LANDMARK), kind=frozenset))
-    wait: int
+    STATE = State(last_step=Int(), next_step=Int(), tried=Each(Row(LANDMARK, LANDMARK), kind=frozenset))
     last_step: int
     next_step: int
     tried: frozenset[tuple[int, int]]
@@ -95,7 +85,6 @@ class MergeScheduler:
         options=Options(AttemptOptions), alignment=Options(AlignmentOptions),
         records=Dict(PAIR, Record(AttemptRecord)), blocks=Each(Row(PAIR, Int()), kind=list),
         uncertainties=Dict(Row(ROBOT, ROBOT), Float(0.0, math.inf)),
-        motions=Dict(Row(ROBOT, ROBOT), Array(FLOAT64, "3", constant=True)),
     )  # fmt: skip
 
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
@@ -105,7 +94,6 @@ class MergeScheduler:
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
         self._blocks: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
-        self._motions: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
 
     def is_due(self, step: int) -> bool:
         """Return whether a pair may try at this step."""
@@ -140,42 +128,21 @@ class MergeScheduler:
                 self._proposed = {pair: matches}
         return best
 
-    def should_defer(self, pair: PairKey, uncertainty: float, limit: float = math.inf) -> bool:
+    def should_defer(self, pair: PairKey, uncertainty: float) -> bool:
         """Return whether a pair whose maps align should try again later, and record its uncertainty.
 
-        It should while the uncertainty falls substantially from one attempt to the next, or exceeds the limit. If it
-        does not fall, the paths between the starts and the common landmarks will stay as uncertain for long, and the
-        particles of the merge represent this.
+        It should while the uncertainty falls substantially from one attempt to the next. If it does not fall, the paths
+        between the starts and the common landmarks will stay as uncertain for long: only the joint map can make them
+        known, and the particles of the merge represent the uncertainty.
 
         Args:
             pair: Groups of the attempt; earlier uncertainties count for any of their robots.
-            uncertainty: Relative uncertainty of the motion between the maps, at most 1 for a merge [-].
-            limit: Uncertainty above which no pair merges, even if waiting does not help [-].
+            uncertainty: Relative uncertainty of the motion between the maps; up to 1 there is no need to wait [-].
         """
         robots = [(a, b) for a in pair[0] for b in pair[1]]
         before = min(self._uncertainties.get(key, math.inf) for key in robots)
         self._uncertainties |= {key: min(uncertainty, self._uncertainties.get(key, math.inf)) for key in robots}
-        return uncertainty > 1.0 and (uncertainty > limit or uncertainty < MIN_IMPROVEMENT * before)
-
-    def change(self, pair: PairKey, motion: FloatArray) -> float:
-        """Return the change of the motion since the last attempt of two groups, and record this motion.
-
-        Args:
-            pair: Groups of the attempt.
-            motion: (3,) [m, m, rad] between the frames of the two groups, by their joint graph.
-
-        Returns:
-            The shift over 0.25 m or the turn over 2.5 degrees, whichever is more; infinite without an earlier attempt.
-        """
-        frames = pair[0][0], pair[1][0]
-        before = self._motions.get(frames)
-        self._motions[frames] = as_constant(motion)
-        if before is None:
-            return math.inf
-        x, y, turn = (motion - before).tolist()
-        return max(
-            math.hypot(x, y) / (0.5 * DISTINCT_TRANSLATION), abs(float(wrap_angle(turn))) / (0.5 * DISTINCT_ROTATION)
-        )
+        return 1.0 < uncertainty < MIN_IMPROVEMENT * before
 
     def record(self, pair: PairKey, step: int, success: bool, smoothed: bool = False) -> None:
         """Record an attempt of the pair that `choose` returned: its candidate matches, and its next wait.
@@ -191,11 +158,10 @@ class MergeScheduler:
             gone = set(pair[0]) | set(pair[1])
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
             return
-        wait = self._records[pair].wait if pair in self._records else self._options.every
-        longest = self._options.longest_wait
+        options = self._options
         tried = frozenset() if smoothed else frozenset(self._proposed.get(pair, ()))
-        growth = math.ceil(MIN_LOG_GROWTH * step) if smoothed else 0
-        self._records[pair] = AttemptRecord(min(2 * wait, longest), step, step + max(wait, min(growth, longest)), tried)
+        growth = min(math.ceil(MIN_LOG_GROWTH * step), options.longest_wait) if smoothed else 0
+        self._records[pair] = AttemptRecord(step, step + max(options.every, growth), tried)
 
     def block(self, pair: PairKey, until: int) -> None:
         """Block all pairs of groups with a robot of each side of a pair before a step."""

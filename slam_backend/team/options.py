@@ -1,6 +1,5 @@
 """Options of merges: verification, consistency check and undo."""
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -23,9 +22,6 @@ class MergeOptions:
         min_sigmas: A merge needs 0.5 m and 5 degrees to be at least this many standard deviations of the motion between
             the maps, by the joint graph of both groups, or by the particles of a merge if they have no smoothers.
             Otherwise the attempt is refused as too uncertain, as long as waiting helps. 0: no such refusal.
-        least_sigmas: Number of standard deviations that suffices where waiting does not help and two attempts in a row
-            find the same motion. 0: there a merge may have any uncertainty, as is right if no later measurement could
-            reduce it.
         watch_steps: Number of steps, counted with robots of both sides in contact, in which a merge is monitored and
             can be undone; then its snapshot is freed. 0: merges are final.
         watch_every: Steps between two checks of a merge.
@@ -34,12 +30,14 @@ class MergeOptions:
             merge is undone [-].
     """
 
-    GONE: ClassVar[dict[str, str]] = {"min_sigmas_on_trial": "Use least_sigmas."}
+    GONE: ClassVar[dict[str, str]] = dict.fromkeys(
+        ("min_sigmas_on_trial", "least_sigmas"),
+        "Drop it: groups merge with any uncertainty where waiting does not help.",
+    )
 
     merged_particles: int | None = None
     smooth_first: bool = True
     min_sigmas: float = 5.0
-    least_sigmas: float = 0.0
     watch_steps: int = 200
     watch_every: int = 20
     blocked_steps: int = 200
@@ -52,19 +50,7 @@ class MergeOptions:
         if not isinstance(self.smooth_first, bool):
             raise argument_error("merging.smooth_first", "True or False", self.smooth_first, "Give a bool.")
         check_float("merging.min_sigmas", self.min_sigmas, "Use 5, or 0 to merge with any uncertainty.", at_least=0.0)
-        hint = "Use 3, or 0 to merge in the end with any uncertainty."
-        check_float("merging.least_sigmas", self.least_sigmas, hint, at_least=0.0)
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.", MOST)
         check_int("merging.watch_every", self.watch_every, 1, "Give a number of steps, 1 for every step.", MOST)
         check_int("merging.blocked_steps", self.blocked_steps, 0, "Use 0 to let them try at once.", MOST)
         check_float("merging.max_deformed", self.max_deformed, "Give a share.", at_least=0.0, at_most=1.0)
-
-    @property
-    def max_uncertainty(self) -> float:
-        """Uncertainty, 1 = `min_sigmas`, above which no pair merges; infinite if any merges in the end."""
-        return self.min_sigmas / self.least_sigmas if self.least_sigmas else math.inf
-
-    @property
-    def trusted_uncertainty(self) -> float:
-        """Uncertainty up to which a merge begins from the relative start; above it from the alignment of the maps."""
-        return max(self.max_uncertainty, 1.0) if self.least_sigmas else 1.0

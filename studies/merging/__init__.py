@@ -1,1 +1,1 @@
-"""Merges of maps in soak runs: outcomes, claims of relative poses, and tables of kept runs."""
+"""Merges of maps in soak runs: outcomes, and tables of kept runs."""

@@ -72,7 +72,7 @@ class Setting:
         shift: Shift of forced merges [m]; None: the wrong transform with the best fit.
         rejuvenate_every: Interval of rejuvenations; None: never in aisles, the default in environments.
         straighten: Whether maps are smoothed before a merge.
-        sure, least_sigmas: Required certainty of a transform, see `MergeOptions`; None: the default.
+        sure: Required certainty of a transform, see `MergeOptions.min_sigmas`.
     """
 
     forced: bool = False
@@ -80,13 +80,11 @@ class Setting:
     rejuvenate_every: int | None = None
     straighten: bool = True
     sure: float = MergeOptions().min_sigmas
-    least_sigmas: float | None = None
 
     @property
     def merging(self) -> dict[str, Any]:
         """Merge options."""
-        options = {"smooth_first": self.straighten, "min_sigmas": self.sure}
-        return options if self.least_sigmas is None else options | {"least_sigmas": self.least_sigmas}
+        return {"smooth_first": self.straighten, "min_sigmas": self.sure}
 
     @property
     def filter(self) -> dict[str, Any]:
@@ -319,9 +317,6 @@ def main(
     sure: Annotated[
         float, typer.Option(help="Required certainty of a merge in standard deviations; 0: none.")
     ] = MergeOptions().min_sigmas,
-    least_sigmas: Annotated[
-        float | None, typer.Option(help="Value for MergeOptions; 0: no trials.", show_default="the default")
-    ] = None,
     world: Annotated[list[str] | None, typer.Option(help="World family, floor plan, or folder of floor plans.")] = None,
     seeds: Annotated[int, typer.Option(help="Number of seeds of each given world.")] = 3,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all results to this file.")] = None,
@@ -341,8 +336,7 @@ def main(
     if json_file is not None:
         check_writable(json_file, "json")
     setting = Setting(
-        forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten, sure=sure,
-        least_sigmas=least_sigmas,
+        forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten, sure=sure
     )  # fmt: skip
     console = Console(highlight=False, soft_wrap=True)
     merges: list[MergeOutcome] = []

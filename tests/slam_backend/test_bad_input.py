@@ -83,7 +83,7 @@ OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
     }),
     MergeOptions: ("merging.", {
         "merged_particles": "1..1000000", "min_sigmas": FROM_ZERO,
-        "least_sigmas": FROM_ZERO, "watch_steps": "0..1e9",
+        "watch_steps": "0..1e9",
         "watch_every": COUNT, "blocked_steps": "0..1e9", "max_deformed": SHARE, "smooth_first": [1],
     }),
     OdometryModel: ("motion.", dict.fromkeys(OdometryModel.__slots__, SIGMA)),

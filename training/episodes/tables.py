@@ -27,7 +27,6 @@ MISSED = {
     "rotation": "The standard deviation of the rotation exceeded its bound.",
     "one match": "Removing one match would have changed the result by more than the bound.",
     "paths": "The uncertainty of the paths left the transform between the starts uncertain beyond the bound.",
-    "repeat": "Two consecutive attempts gave transforms that differ by more than the bound.",
 }
 UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")
 MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair in UPPER))

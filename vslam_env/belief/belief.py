@@ -69,8 +69,7 @@ class BeliefConfig:
         filter: Options of each FastSLAM filter; its camera and motion model hold the assumed noise.
         alignment: Criteria for accepting an alignment of two maps.
         attempts: Schedule of the merge attempts.
-        merging: Options of merges and their rollback. By default robots whose starts are not known at three standard
-            deviations do not merge (`MergeOptions.least_sigmas`): maps are scored in the robots' own start frames.
+        merging: Options of merges and their rollback.
         confirm_after: Number of measurements after which a landmark belongs to a robot's map; a landmark measured only
             once may be a false point.
     """
@@ -78,7 +77,7 @@ class BeliefConfig:
     filter: FilterOptions = field(default_factory=default_filter_options)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     attempts: AttemptOptions = field(default_factory=AttemptOptions)
-    merging: MergeOptions = field(default_factory=lambda: MergeOptions(least_sigmas=3.0))
+    merging: MergeOptions = field(default_factory=MergeOptions)
     confirm_after: int = 2
 
     def __post_init__(self) -> None:
