@@ -11,7 +11,14 @@ from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import between
-from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MergeUndone, TeamReport
+from slam_backend.team.reports import (
+    LandmarkIdMap,
+    LandmarksCreated,
+    MapForked,
+    MergeEvent,
+    MergeUndone,
+    TeamReport,
+)
 from slam_backend.team.team import TeamSlam
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam
@@ -63,6 +70,7 @@ class FilterTrack:
     # landmark, whichever map holds it; `NONE`: rejected
     labels: tuple[tuple[IntArray, ...], ...]
     merges: tuple[tuple[int, tuple[int, ...], tuple[int, ...]], ...]  # Tick and groups of merges that were not undone
+    events: tuple[MergeEvent, ...]  # Attempts, merges and undos
 
 
 def record_episode(env: ExplorationEnv, policies: Mapping[str, Policy] | GuardedTeam, seed: int) -> RecordedEpisode:
@@ -114,7 +122,8 @@ def replay(episode: RecordedEpisode, options: FilterOptions) -> FilterTrack:
         paths.append(points.own.copy())
         covariances.append(points.covariances.copy())
     return FilterTrack(
-        np.stack(paths, axis=1), np.stack(covariances, axis=1), labels.resolved(), labels.merges()
+        np.stack(paths, axis=1), np.stack(covariances, axis=1), labels.resolved(), labels.merges(),
+        team.events,
     )  # fmt: skip
 
 
