@@ -30,7 +30,7 @@ class IdealTeam(NamedTuple):
     """What an ideal team knows at the end of an episode.
 
     Attributes:
-        merges: Its merges.
+        merges: Merges in order.
         paths: (K, T, 3) float64 [m, m, rad], own start frames. Each pose from the readings up to its own tick.
         map_errors: (K,) float64 [m]. Map error E of each robot at the end.
     """
