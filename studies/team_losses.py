@@ -40,10 +40,10 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     """Run an episode, and compare its filters with the ideal team.
 
     Returns:
-        `condition`: name of all but the seed. `map_error` at the end, mean over the robots, `ideal_map_error`, and the
-        `excess` of the former; position RMS [m] of both, and their ratio `over_ideal`; `merges` that were not undone,
-        `ideal_merges`; `false_merges` among the former; `waits`: seconds from ideal merges to those of the filters, by
-        what kept the groups apart, and their sum `wait_s`. If the policy fails, the error as `failed` alone.
+        `map_error` at the end, mean over the robots, `ideal_map_error`, and the `excess` of the former; position RMS
+        [m] of both, and their ratio `over_ideal`; `merges` that were not undone, `ideal_merges`; `false_merges` among
+        the former; `waits`: seconds from ideal merges to those of the filters, by what kept the groups apart, and their
+        sum `wait_s`. If the policy fails, the error as `failed` alone.
     """
     env = vslam_v1.parallel_env(config=environment(config, trial))
     try:
@@ -60,7 +60,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     waits = {reason: TICK * ticks for reason, ticks in waits_by_reason(episode, ideal.merges, track.events).items()}
     kept = [merge for merge in episode.record.merges if merge.undone is None]
     return {
-        "condition": trial.condition, "map_error": held, "ideal_map_error": float(ideal.map_errors.mean()),
+        "map_error": held, "ideal_map_error": float(ideal.map_errors.mean()),
         "excess": held - float(ideal.map_errors.mean()), "position_rms_m": own, "ideal_position_rms_m": best,
         "over_ideal": losses.ratio(own, best), "merges": len(track.merges), "ideal_merges": len(ideal.merges),
         "false_merges": sum(merge.is_false for merge in kept), "waits": waits, "wait_s": sum(waits.values()),
@@ -92,7 +92,7 @@ STUDY = Study(
     quick={"worlds": ("office",), "seeds": 2, "duration": 30.0, "particles": (30,)},
     tables=(
         ResultTable(
-            name="teams", title="Filters and the ideal team on the same readings", by=("condition",),
+            name="teams", title="Filters and the ideal team on the same readings", by=("preset", "world", "robots"),
             columns=(
                 Column("map_error", "E [m]", digits=3), Column("ideal_map_error", "E ideal [m]", digits=3),
                 Column("excess", "excess [cm]", digits=1, factor=100.0, interval=True),

@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray
+from studies.beside_gtsam import one_thread
 from training.stereo_runs.batch_problem import BatchProblem, Estimate
 
 
+@one_thread()
 def solve_with_gtsam(gtsam: ModuleType, problem: BatchProblem, start: Estimate) -> tuple[Estimate, list[FloatArray]]:
     """Return gtsam's estimate, and its marginal covariances of the last pose of each robot.
 
