@@ -3,8 +3,8 @@
 python -m studies.team_losses --worlds office,loops --presets hard --seeds 4
 """
 
-from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from slam_backend.core.blas import single_threaded_blas
 from studies import losses
 from studies.bounds.episodes import record_episode, replay
-from studies.bounds.ideal_team import ideal_team, waits_by_reason
+from studies.bounds.ideal_team import NO_CONTACT, NOT_TRIED, ideal_team, waits_by_reason
 from studies.losses import LONGEST_DECISION, Trial, checks, environment, errors_of, trials
 from training.bench.exploration.players import parted
 from training.commands.study import run_program
@@ -67,13 +67,21 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _reasons(rows: Sequence[Row]) -> str:
-    """Return the mean waits of an episode [s] by reason."""
-    total: Counter[str] = Counter()
-    for row in rows:
-        total.update(row["waits"])
-    return ", ".join(f"{reason} {seconds / len(rows):.1f}" for reason, seconds in total.most_common())
+def _wait_for(reason: str, rows: Sequence[Row]) -> float:
+    """Return the mean wait of an episode for a reason [s]: the first of `REASONS` that its name begins with."""
+    waits = [
+        seconds
+        for row in rows
+        for name, seconds in row["waits"].items()
+        if reason == next((each for each in REASONS if name.startswith(each)), "")
+    ]
+    return float(sum(waits)) / len(rows)
 
+
+REASONS = {  # what kept groups apart, with headings
+    "too uncertain: paths": "paths [s]", "too uncertain": "landmarks [s]", "too few inliers": "few inliers [s]",
+    "ambiguous": "ambiguous [s]", NOT_TRIED: "not tried [s]", NO_CONTACT: "no contact [s]",
+}  # fmt: skip
 
 STUDY = Study(
     name="team_losses",
@@ -98,8 +106,15 @@ STUDY = Study(
                 Column("excess", "excess [cm]", digits=1, factor=100.0, interval=True),
                 Column("over_ideal", "position over ideal", "geometric mean", digits=2, interval=True),
                 Column("merges", digits=2), Column("ideal_merges", "ideal", digits=2),
-                Column("false_merges", "false", "sum", digits=0), Column("wait_s", "wait [s]", digits=1),
-                Column("waits", "for [s]", _reasons),
+                Column("false_merges", "false", "sum", digits=0),
+            ),
+        ),
+        ResultTable(
+            name="waits", title="Waits from ideal merges to those of the filters, by what kept the groups apart",
+            by=("preset", "world", "robots"),
+            columns=(
+                Column("wait_s", "all [s]", digits=1),
+                *(Column("waits", name, partial(_wait_for, reason), digits=1) for reason, name in REASONS.items()),
             ),
         ),
     ),

@@ -73,5 +73,10 @@ def test_the_study_compares_errors_and_merges() -> None:
     assert 0.0 < row["ideal_map_error"] < 1.0
     assert row["wait_s"] == pytest.approx(sum(row["waits"].values()))
     assert row["ideal_merges"] > 0 or not row["waits"]
-    (line,) = STUDY.tables[0].lines([{"preset": "hard", "world": "fig5", "robots": 2} | row])
-    assert "None" not in STUDY.tables[0].cells(line)
+    waits = {"too uncertain: paths": 2.0, "too uncertain: rotation": 1.0, "too few inliers": 0.5}
+    rows = [{"preset": "hard", "world": "fig5", "robots": 2} | row | {"waits": waits, "wait_s": 3.5}] * 2
+    (line,), (parts,) = (table.lines(rows) for table in STUDY.tables)
+    assert line["merges"].value == row["merges"]
+    assert [parts[name].value for name in ("all [s]", "paths [s]", "landmarks [s]", "few inliers [s]")] == [
+        3.5, 2.0, 1.0, 0.5,
+    ]  # fmt: skip

@@ -13,6 +13,7 @@ from training.commands._options import options
 from training.commands._progress import share_progress
 from training.commands._run_folder import Call
 from training.episodes.tables import print_consistency, print_tables, write_maps
+from training.experiments.console import print_warning
 from training.experiments.tables import console_table
 from training.replay.config import (
     KITTI,
@@ -158,6 +159,8 @@ def _replay(call: Call[Any], config: ReplayConfig, reader: "Callable[..., Log]")
     call.write(shown)
     print_tables(console, shown)
     print_consistency(console, shown["consistency"])
+    for cause in shown["set_up"]:
+        print_warning(f"robot {cause['robot']}, {cause['cause']}: {cause['text']}", console)
     names = {group: "-".join(str(log.robots[robot].number) for robot in group) for group in result.groups}
     lines += [*_summary(shown), f"Filter time: {result.seconds:.1f} s, {result.speed:.0f} times real time."]
     for line in [*lines, write_maps(folder, {name: result.maps[group[0]] for group, name in names.items()})]:

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
+from slam_backend.diagnosis import Cause, diagnose
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import PoseEstimate, RejuvenationReport
 from slam_backend.geometry import compose
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.models.measurements import Measurements
 from slam_backend.team.reports import LandmarksCreated, MergeEvent, PairAttempts, TeamReport
 from slam_backend.team.team import TeamSlam
 from slam_backend.trajectory import dead_reckoning
@@ -84,6 +86,7 @@ class Replay:
     measurements: Mapping[str, int]
     rejuvenations: Mapping[str, Any]  # Rejuvenations of all filters, see `RejuvenationCount.to_mapping`
     consistency: tuple[Consistency, ...]  # Consistency of each robot's filter at the end
+    causes: tuple[tuple[Cause, ...], ...]  # Likely mistakes in the set-up of each robot's log
     seconds: float  # Computing time of the filters [s]
 
     @property
@@ -165,6 +168,7 @@ def replay_log(
     contacts = np.eye(len(robots), dtype=np.bool_) if log.alone else None
     ground_truth = _claims_of(log) if log.has_identities else None
     paths, odometry = np.zeros((2, len(robots), num_steps, 3))
+    seen: list[list[Measurements | None]] = [[] for _ in robots]
     merges: list[Merge] = []
     stages: list[tuple[int, Mapping[int, LandmarkMap]]] = []
     attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
@@ -193,6 +197,7 @@ def replay_log(
         for robot in robots:
             paths[robot, step] = team.pose_from_start(robot).mean
             odometry[robot, step] = 0.0 if moves[robot] is None else moves[robot]
+            seen[robot].append(taken[robot][1])
         for _, attempt in report.rejuvenations:
             rejuvenations.add(attempt)
         since = float(times[step] - times[0])
@@ -224,13 +229,17 @@ def replay_log(
         dead_reckoning(np.zeros(3), odometry[number, 1:]) if robot.reckoned is None else robot.reckoned[:num_steps]
         for number, robot in enumerate(log.robots)
     ]
+    noise = {name: log.options[name] for name in ("camera", "motion") if name in log.options}
+    named = [robot.identities[:num_steps] if log.identified and robot.identities else None for robot in log.robots]
+    causes = [diagnose(odometry[robot], seen[robot], named[robot], **noise) for robot in robots]
     return Replay(
         times=times, paths=paths, reckoned=np.array(reckoned), stages=tuple(stages), groups=team.groups,
         maps=tuple(own.moved(frame) for own, frame in zip(maps, frames_of, strict=True)),
         claims=tuple(map(true_ids, robots, maps)), start_from_group=frames_of, merges=tuple(merges), attempts=attempts,
         pairs=None if log.alone else team.pair_attempts,
         measurements=getattr(team, "measurements", {}),
-        rejuvenations=rejuvenations.to_mapping(), consistency=tuple(map(team.consistency, robots)), seconds=seconds,
+        rejuvenations=rejuvenations.to_mapping(), consistency=tuple(map(team.consistency, robots)),
+        causes=tuple(causes), seconds=seconds,
     )  # fmt: skip
 
 

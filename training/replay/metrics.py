@@ -205,6 +205,11 @@ def summarise(result: Replay, log: Log, scores: Sequence[PathScore | None]) -> d
         "landmarks": sum(len(result.maps[group[0]]) for group in result.groups), "measurements": result.measurements,
         "rejuvenations": result.rejuvenations, "duration_s": float(result.times[-1] - result.times[0]),
         "notes": log.notes,
+        "set_up": [
+            {"robot": number, "cause": cause.name, "text": cause.text, "ratio": cause.ratio}
+            for number, causes in zip(numbers, result.causes, strict=True)
+            for cause in causes
+        ],
         "consistency": consistency_rows(numbers, result.consistency),
     }  # fmt: skip
 

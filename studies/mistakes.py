@@ -1,0 +1,136 @@
+"""Mistakes in the set-up of a log, each made in the circle world of the tutorial, and what `diagnose` says of it.
+
+python -m studies.mistakes --seeds 20
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.diagnosis import diagnose
+from slam_backend.geometry import compose, inverse, transform_points
+from slam_backend.models.measurements import Measurements
+from slam_backend.models.odometry import OdometryModel
+from training.commands.study import run_program
+from training.experiments.config import ExperimentConfig, first_seed, option
+from training.experiments.study import Column, ResultTable, Row, Study
+
+Mistake = Literal[
+    "none", "mirrored x", "sign of turns", "odometry in degrees", "points in centimetres", "odometry in centimetres",
+    "scale", "frozen odometry", "measurement noise", "odometry noise",
+]  # fmt: skip
+MOTION = OdometryModel(sigma_along=0.05, sigma_turn=0.05)
+STEPS, MOVE = 300, np.array([0.2, 0.0, 0.05])  # along a circle of 4 m radius, amid one of landmarks
+POINT_NOISE, TOO_NOISY, WRONG_BASELINE = 0.01, 30.0, 1.2
+
+
+class Config(ExperimentConfig):
+    """Logs with each mistake, with identities and by descriptors."""
+
+    seeds: int = option(20, "Number of logs with each mistake.", ge=1, hint="Use at least one log.")
+    seed: int = first_seed()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One log."""
+
+    mistake: Mistake  # Name of the mistake, as `diagnose` gives it
+    matches: Literal["identities", "descriptors"]  # Means to match landmarks
+    seed: int  # Seed of the noise
+
+
+class CircleLog(NamedTuple):
+    """Log of a robot: odometry (T, 3) [m, m, rad], measurements and their landmarks (n,)."""
+
+    odometry: FloatArray
+    measurements: list[Measurements]
+    identities: list[IntArray]
+
+
+def trials(config: Config) -> list[Trial]:
+    """Return all trials."""
+    return [
+        Trial(mistake=mistake, matches=matches, seed=seed)
+        for mistake in get_args(Mistake)
+        for matches in ("identities", "descriptors")
+        for seed in range(config.seed, config.seed + config.seeds)
+    ]
+
+
+def circle_log(mistake: Mistake, seed: int) -> CircleLog:
+    """Return a log in the circle world of the tutorial with a mistake."""
+    rng = np.random.default_rng(seed)
+    angles = np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False)
+    landmarks = np.column_stack([6.0 * np.cos(angles), 6.0 * np.sin(angles) + 4.0])
+    looks = rng.normal(size=(30, 64)) / 8.0
+    pose, odometry, frames, names = np.zeros(3), np.zeros((STEPS, 3)), [], []
+    noise = POINT_NOISE * (TOO_NOISY if mistake == "measurement noise" else 1.0)
+    for step in range(STEPS):
+        if step:
+            odometry[step] = MOVE * rng.normal(1.02, 0.03, 3)
+            pose = compose(pose, MOVE)
+        body = transform_points(inverse(pose), landmarks)
+        near = np.flatnonzero((body[:, 0] > 0.5) & (np.abs(body[:, 1]) < body[:, 0]) & (np.hypot(*body.T) < 6.0))
+        points = np.column_stack([-body[near, 1], np.zeros(len(near)), body[near, 0]])
+        points = _wrong_points(points + rng.normal(0.0, noise, points.shape), mistake)
+        frames.append(Measurements(points, (looks[near] + rng.normal(0.0, 0.02, (len(near), 64))).astype(np.float32)))
+        names.append(near)
+    if mistake == "odometry noise":
+        odometry[1:] += rng.normal(0.0, 1.0, (STEPS - 1, 3)) * TOO_NOISY * np.sqrt(MOTION.variances(odometry[1:]))
+    return CircleLog(_wrong_odometry(odometry, mistake), frames, names)
+
+
+def _wrong_points(points: FloatArray, mistake: Mistake) -> FloatArray:
+    """Return points (n, 3), camera frame, with a mistake."""
+    factors = {"points in centimetres": 100.0, "scale": WRONG_BASELINE}
+    return points * factors.get(mistake, 1.0) * ([1.0, 1.0, -1.0] if mistake == "mirrored x" else 1.0)
+
+
+def _wrong_odometry(odometry: FloatArray, mistake: Mistake) -> FloatArray:
+    """Return odometry (T, 3) with a mistake."""
+    factors = {
+        "sign of turns": (1.0, 1.0, -1.0), "odometry in degrees": (1.0, 1.0, 180.0 / np.pi),
+        "odometry in centimetres": (100.0, 100.0, 1.0), "frozen odometry": (0.0, 0.0, 0.0),
+    }  # fmt: skip
+    return odometry * factors.get(mistake, (1.0, 1.0, 1.0))
+
+
+def play(config: Config, trial: Trial) -> dict[str, Any]:
+    """Diagnose a log; return what is `said`, and whether that is `right`: the mistake alone."""
+    log = circle_log(trial.mistake, trial.seed)
+    names = log.identities if trial.matches == "identities" else None
+    said = [cause.name for cause in diagnose(log.odometry, log.measurements, names, motion=MOTION)]
+    return {"said": ", ".join(said) or "none", "right": said == ([] if trial.mistake == "none" else [trial.mistake])}
+
+
+def _said(rows: Sequence[Row]) -> str:
+    """Return what is said, with numbers."""
+    return ", ".join(f"{name} {count}" for name, count in Counter(row["said"] for row in rows).most_common())
+
+
+STUDY = Study(
+    name="mistakes",
+    about="""Make each usual mistake in the set-up of a log, and print what the diagnosis says of it.
+
+    A robot drives on a circle amid a circle of landmarks, which have identities, or descriptors alone.
+    """,
+    config=Config,
+    trial=Trial,
+    trials=trials,
+    play=play,
+    quick={"seeds": 2},
+    tables=(
+        ResultTable(
+            name="mistakes", title="What is said of logs with one mistake each", by=("mistake", "matches"),
+            columns=(Column("right", "right [%]", digits=0, factor=100.0), Column("said", "said", _said)),
+        ),
+    ),
+)  # fmt: skip
+
+if __name__ == "__main__":
+    run_program(STUDY)

@@ -1,0 +1,73 @@
+"""Diagnosis of a log's set-up: usual mistakes are named, right logs are not blamed."""
+
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slam_backend.diagnosis import CAUSES, diagnose, find_motions
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.measurements import Measurements
+from studies.mistakes import MOTION, Mistake, circle_log
+
+
+@pytest.mark.parametrize("by_names", [True, False])
+@pytest.mark.parametrize("mistake", get_args(Mistake))
+def test_a_mistake_is_named_alone(mistake: Mistake, by_names: bool) -> None:
+    """Each mistake is named in three of three logs, and nothing else; a right log gets no word."""
+    for seed in range(500, 503):
+        log = circle_log(mistake, seed)
+        found = diagnose(log.odometry, log.measurements, log.identities if by_names else None, motion=MOTION)
+        assert [cause.name for cause in found] == ([] if mistake == "none" else [mistake])
+        assert all(cause.text and "{" not in cause.text for cause in found)
+        assert {cause.name for cause in found} <= CAUSES.keys()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.5, 2.0), st.integers(0, 1000))
+def test_scales_are_measured(scale: float, seed: int) -> None:
+    """The ratio of ways is that by which the odometry is wrong, to 3 %; below 15 % it is no mistake."""
+    log = circle_log("none", seed)
+    odometry = log.odometry * [1.0 / scale, 1.0 / scale, 1.0]
+    found = diagnose(odometry, log.measurements, log.identities, motion=MOTION)
+    true = scale / 1.02  # the log's odometry is 2 % too long
+    if abs(true - 1.0) > 0.19:
+        assert [cause.name for cause in found] == ["scale"]
+        assert found[0].ratio == pytest.approx(true, rel=0.03)
+    elif abs(true - 1.0) < 0.11:
+        assert found == ()
+
+
+def test_motions_are_those_of_the_robot() -> None:
+    """Without noise the sightings tell the motion between two frames exactly, and their points fit."""
+    log = circle_log("none", 3)
+    clean = circle_log("none", 3)
+    camera = StereoCamera()
+    found = find_motions(clean.odometry, clean.measurements, log.identities, camera, MOTION)
+    assert len(found.turns) > 20
+    turns = np.median(found.sighted[:, 2] / found.turns)
+    assert turns == pytest.approx(1.0 / 1.02, abs=0.02)
+
+
+def test_logs_that_tell_nothing_get_no_word() -> None:
+    """Empty frames, single landmarks, look-alikes without identities, and short logs are not judged."""
+    log = circle_log("sign of turns", 1)
+    alike = [Measurements(frame.points, np.ones((len(frame), 1), np.float32)) for frame in log.measurements]
+    one = [Measurements(frame.points[:1], frame.descriptors[:1]) for frame in log.measurements]
+    empty = [Measurements(frame.points[:0], frame.descriptors[:0]) for frame in log.measurements]
+    for frames in (alike, one, empty, [None] * len(log.odometry)):
+        assert diagnose(log.odometry, frames, motion=MOTION) == ()
+    assert diagnose(log.odometry[:30], log.measurements[:30], motion=MOTION) == ()
+
+
+def test_bad_arguments_are_refused() -> None:
+    """Lengths that disagree are named."""
+    log = circle_log("none", 1)
+    with pytest.raises(ValueError, match="measurements: expected a list of 300 entries, one for each step, got a list"):
+        diagnose(log.odometry, log.measurements[:-1])
+    with pytest.raises(ValueError, match="identities: expected a list of 300 entries"):
+        diagnose(log.odometry, log.measurements, log.identities[:-1])
+    with pytest.raises(ValueError, match="odometry: expected"):
+        diagnose(log.odometry[:, :2], log.measurements)
