@@ -181,6 +181,8 @@ def parse_toml(text: str, name: str, source: str | PathLike[str], hint: str = ""
         found = re.match(r"line (\d+), column (\d+)", at)
         where = place(source, int(found[1]), int(found[2])) if found else str(source)
         raise _syntax_error(name, "TOML", reason, where, hint) from error
+    except ValueError as error:  # an int of thousands of digits
+        raise _syntax_error(name, "TOML", str(error), str(source), hint) from error
     except RecursionError as error:
         raise _syntax_error(name, "TOML", "nested too deeply", str(source), hint) from error
 

@@ -107,12 +107,11 @@ class RunConfig(ExperimentConfig):
     def decision_ticks(self) -> int | None:
         """Ticks between decisions of a trained policy, as in its training; None for other policies: the default."""
         from agents.registry import is_model
-        from agents.trained import load_model
-        from vslam_env.config import EnvConfig
+        from agents.trained import training_environment
 
         if not is_model(self.policy):
             return None
-        trained = EnvConfig.from_toml_text(load_model(self.policy)[1]["environment"])
+        trained = training_environment(self.policy, "policy")
         return None if self.action_type != "goal" else trained.decision_ticks
 
     @property

@@ -160,6 +160,8 @@ def joined(parts: Sequence[Labels]) -> Labels:
 
 def _unpacked(arrays: Mapping[str, NDArray[Any]]) -> Labels:
     """Return the labels of the arrays in a file."""
+    if arrays["chosen"].dtype.kind not in "iu" or arrays["preferences"].dtype.kind != "f":
+        raise ValueError("labels of another type")
     chosen, preferences = arrays["chosen"].astype(np.int64), arrays["preferences"].astype(np.float32)
     n, num_actions = len(chosen), SHAPES["action_mask"][0]
     if preferences.shape != (n, num_actions) or chosen.ndim != 1 or ((chosen < 0) | (chosen >= num_actions)).any():

@@ -99,10 +99,15 @@ def test_bad_json(tmp_path: Path, text: str, message: str) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("a = 1 2", "line 1, column 7 of b.toml"), ("a = " + "[" * 20_000, "nested too deeply"), ("a = ", "b.toml")],
+    [
+        ("a = 1 2", "line 1, column 7 of b.toml"),
+        ("a = " + "[" * 20_000, "nested too deeply"),
+        ("a = ", "b.toml"),
+        ("a = " + "9" * 5000, "Exceeds the limit"),
+    ],
 )
 def test_bad_toml(text: str, message: str) -> None:
-    """Malformed and deeply nested TOML is refused in one line with its place."""
+    """Malformed and deeply nested TOML, and ints of thousands of digits, are refused in one line with its place."""
     with pytest.raises(ValueError, match="config: expected a file in TOML") as caught:
         parse_toml(text, "config", "b.toml")
     assert message in str(caught.value)

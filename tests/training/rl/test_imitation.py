@@ -138,7 +138,7 @@ def test_foreign_and_damaged_labels_are_refused(tmp_path: Path) -> None:
     for changed in (
         {"scan": arrays["scan"][:, :16]}, {"scan": arrays["scan"][0]}, {"preferences": arrays["preferences"][:, :17]},
         {"local_grid": arrays["local_grid"][:, :, :5]}, {"chosen": arrays["chosen"] + 33},
-        {"chosen": arrays["chosen"].astype(np.int64) - 99},
+        {"chosen": arrays["chosen"].astype(np.int64) - 99}, {"chosen": arrays["chosen"] * np.nan},
         {"preferences": arrays["preferences"] * np.float16(np.nan)}, {"scan": arrays["scan"] | np.uint8(0x7C)},
     ):  # fmt: skip
         np.savez(file, **arrays | changed)
