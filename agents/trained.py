@@ -17,7 +17,6 @@ from slam_backend.core.validation import argument_error
 from vslam_env.belief.observation import action_mask, observe
 from vslam_env.belief.observation_keys import MASK
 from vslam_env.belief.team_belief import Belief
-from vslam_env.config import EnvConfig
 from vslam_env.navigation import CANDIDATE_FEATURES
 
 FORMAT = 3  # incremented when the network or the meaning of observations changes
@@ -145,24 +144,6 @@ def load_model(path: str | Path, argument: str = "model") -> tuple[Weights, dict
         hint = f"{str(file)!r} was made by another program. Train again."
         raise argument_error(argument, "the environment of its training", "no text 'environment'", hint)
     return arrays, about
-
-
-def training_environment(path: str | Path, argument: str = "model") -> EnvConfig:
-    """Return the environment in which a model was trained.
-
-    Args:
-        path: Path of the model, or of the run folder that contains it.
-        argument: Name of the path in errors.
-
-    Raises:
-        ValueError: If the model cannot be read, or its environment is none of this version.
-    """
-    text = load_model(path, argument)[1]["environment"]
-    try:
-        return EnvConfig.from_toml_text(text)
-    except ValueError as error:
-        hint = f"{str(path)!r} cannot be used. Train again. Error: {error}"
-        raise argument_error(argument, "a model with an environment of this version", "another one", hint) from error
 
 
 def _check_weights(argument: str, file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

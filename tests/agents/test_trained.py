@@ -28,16 +28,7 @@ from agents.goal_network import (
 )
 from agents.policy import keys_for, keys_of
 from agents.registry import LEARNED, POLICIES, action_types
-from agents.trained import (
-    FORMAT,
-    OWN_GOAL,
-    TrainedGoalPolicy,
-    _digest,
-    check_observation,
-    load_model,
-    save_model,
-    training_environment,
-)
+from agents.trained import FORMAT, OWN_GOAL, TrainedGoalPolicy, _digest, check_observation, load_model, save_model
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, EnvConfig, vslam_v0, vslam_v1
 from vslam_env.belief.observation import action_mask, observation_space
 
@@ -339,14 +330,6 @@ def test_models_without_their_environment_are_refused(tmp_path: Path) -> None:
         np.savez(tmp_path / "model.npz", about=np.array(text))
         with pytest.raises(ValueError, match=r"model: .* got a broken file"):
             load_model(tmp_path)
-
-
-@pytest.mark.parametrize("text", ["[[[", "num_robots = 1000", "max_cycles = inf", "num_robots = " + "9" * 5000])
-def test_models_of_no_possible_environment_are_refused(text: str, tmp_path: Path) -> None:
-    """Where the environment of a training is read, one that cannot be made is an error of the model, in one line."""
-    save_model(tmp_path / "model.npz", _weights(), {"environment": text})
-    with pytest.raises(ValueError, match=r"^policy: expected a model .* cannot be used\. Train again\. Error: .*\Z"):
-        training_environment(tmp_path, "policy")
 
 
 def test_other_spaces_are_refused() -> None:
