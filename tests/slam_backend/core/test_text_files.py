@@ -1,5 +1,6 @@
 """The reader of users' text files: encodings, limits, and places in errors."""
 
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,17 @@ def test_size_is_limited(tmp_path: Path) -> None:
         stream.truncate((1 << 20) + 1)
     with pytest.raises(ValueError, match="at most 1 MiB"):
         read_text(file, most_megabytes=1)
+
+
+def test_reading_takes_memory_for_the_file_and_not_for_its_limit(tmp_path: Path) -> None:
+    """A file of two bytes that may have a GiB is read in less than a MiB."""
+    (tmp_path / "a.txt").write_text("ab")
+    tracemalloc.start()
+    try:
+        assert read_text(tmp_path / "a.txt", most_megabytes=1024) == "ab"
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
