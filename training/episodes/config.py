@@ -193,7 +193,10 @@ def training_environment(path: str, argument: str) -> "EnvConfig":
 
     text = load_model(path, argument)[1]["environment"]
     try:
-        return EnvConfig.from_toml_text(text)
+        config = EnvConfig.from_toml_text(text)
+        if config.action_type != "goal":
+            raise argument_error("action_type", "goal, as vslam train has it", config.action_type, "Check the model.")
+        return config
     except ValueError as error:
         hint = f"Train again, {str(path)!r} cannot be used: {error}"
         raise argument_error(argument, "a model of an environment of this version", "another one", hint) from error

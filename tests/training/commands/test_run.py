@@ -428,7 +428,7 @@ def test_a_config_repeats_a_run_from_any_folder(monkeypatch: pytest.MonkeyPatch,
     assert RunConfig(world="fig5").to_mapping()["world"] == "fig5"
 
 
-@pytest.mark.parametrize("text", ["[[[", "num_robots = 1000", "max_cycles = inf", "num_robots = " + "9" * 5000])
+@pytest.mark.parametrize("text", ["", "[[[", "num_robots = 1000", "max_cycles = inf", "num_robots = " + "9" * 5000])
 def test_models_of_impossible_environments_are_refused(text: str, tmp_path: Path) -> None:
     """An environment of a training that cannot be made is an error of the model, in one line."""
     weights, about = load_model(LEARNED)
