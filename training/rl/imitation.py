@@ -129,7 +129,7 @@ def read_labels(file: Path, about: Mapping[str, Any]) -> Labels:
     """
     expected = "labels that vslam train wrote"
     if not file.is_file():
-        raise argument_error("labels", expected, "no such file", f"Check {str(file)!r}.")
+        raise argument_error("labels", expected, "no such file", f"Copy {str(file)!r} again, or use another folder.")
     try:
         arrays = dict(read_arrays(file))
         found = json.loads(str(arrays.pop(ABOUT)))
@@ -442,6 +442,8 @@ class Imitation:
     def _labels(self, number: int, part: int, split: str, on_progress: Progress) -> Labels:
         """Return the labels of a file, collected first unless the checkpoint says that they were.
 
+        A lost file is collected again where its driver is at hand: the teacher, or a pupil that has not learned since.
+
         Raises:
             ValueError: If the file is missing or damaged, or of another run.
         """
@@ -449,7 +451,8 @@ class Imitation:
         file = self._folder / LABELS / f"{name}.npz"
         env_configs = config.make_env_configs(split)
         about = {"environment": [each.to_toml() for each in env_configs], "seed": config.seed, "file": name}
-        if name not in self._returns:
+        has_driver = number in (0, len(self.rows) / config.epochs)
+        if name not in self._returns or (has_driver and not file.is_file()):
             file.parent.mkdir(exist_ok=True)
             if split not in self._envs:
                 self.close()
