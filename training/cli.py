@@ -130,7 +130,7 @@ def main() -> None:
 
 
 def run(app: typer.Typer, name: str) -> None:
-    """Run commands under a name; bad input gives one line on stderr and exit status 2.
+    """Run commands under a name; bad input, a full disk or no memory gives one line on stderr and exit status 2.
 
     A command stopped by SIGINT or SIGTERM, at once or after finishing its current work, exits with 128 + signal number.
     """
@@ -150,6 +150,8 @@ def run(app: typer.Typer, name: str) -> None:
             if not is_argument_error(error):
                 raise
             _refuse(str(error))
+        except MemoryError as error:
+            _refuse(f"memory: expected more of it, got none left. Use less, or raise ulimit -v. {error}".rstrip())
         except OSError as error:
             if _has_no_folder():
                 _refuse("folder: expected a current folder, got a deleted one. Change into one that exists.")

@@ -6,6 +6,7 @@ limited in size before memory is taken, and no content runs code.
 
 import codecs
 import json
+import os
 import re
 from collections.abc import Hashable, Iterable, Iterator
 from functools import cache
@@ -64,13 +65,14 @@ def read_bytes(path: str | PathLike[str], name: str, kind: str, most_megabytes: 
     Raises:
         ValueError: If the file is missing, cannot be read or is larger than `most_megabytes` [2^20 bytes].
     """
-    file = existing_file(path, name, kind)
+    file, most = existing_file(path, name, kind), most_megabytes << 20
     try:
         with open(file, "rb") as stream:
-            content = stream.read((most_megabytes << 20) + 1)
+            size = os.fstat(stream.fileno()).st_size
+            content = stream.read() if size <= most else b""  # read(most) would take that much memory for any file
     except OSError as error:
         raise argument_error(name, f"{kind} that can be read", file, f"The system says: {error.strerror}.") from error
-    if len(content) > most_megabytes << 20:
+    if max(size, len(content)) > most:
         raise argument_error(name, f"{kind} of at most {most_megabytes} MiB", file, "Split it, or drop what is unused.")
     return content
 
@@ -181,6 +183,8 @@ def parse_toml(text: str, name: str, source: str | PathLike[str], hint: str = ""
         found = re.match(r"line (\d+), column (\d+)", at)
         where = place(source, int(found[1]), int(found[2])) if found else str(source)
         raise _syntax_error(name, "TOML", reason, where, hint) from error
+    except ValueError as error:  # an int of thousands of digits
+        raise _syntax_error(name, "TOML", str(error), str(source), hint) from error
     except RecursionError as error:
         raise _syntax_error(name, "TOML", "nested too deeply", str(source), hint) from error
 

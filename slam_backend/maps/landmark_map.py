@@ -257,7 +257,7 @@ class LandmarkMap:
             found = read_arrays(Path(path))
             kind, version = str(found["format"]), int(found["version"])
             arrays = {name: found[name] for name in FIELDS} if version == FORMAT_VERSION else {}
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise argument_error("path", expected, "a broken file", hint) from error
         if kind != FORMAT or version != FORMAT_VERSION:
             raise argument_error("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", hint)

@@ -26,6 +26,7 @@ from slam_backend.state.format import parts_of
 
 ALIGNMENT = 64  # alignment of arrays [bytes]
 MAX_TABLE = 1 << 26  # limit of a table [bytes]; parsed, it takes up to twenty times as much memory
+MOST_VISITS = 1 << 27  # limit of the sum over all parts of their parts within, as often as they are shared
 LARGEST_INT = 1 << 63  # larger ints are written as hexadecimal digits
 DTYPES = {
     np.dtype(kind).newbyteorder("<").str: np.dtype(kind)
@@ -159,6 +160,8 @@ class _Reader:
             raise ValueError("no table of rows")
         self._rows, self._root = content
         self._parts: list[Any] = []
+        self._sizes: dict[int, int] = {}  # number of all parts within a part, by row
+        self._visits = 0
 
     def tree(self) -> Any:
         """Return the tree."""
@@ -177,15 +180,25 @@ class _Reader:
             raise ValueError(f"a row {row} before it is defined")
         return self._parts[row]
 
+    def _values(self, entries: list[Any]) -> list[Any]:
+        """Return the values of a row's entries, unless hashing or checking them would take for ever."""
+        values = list(map(self._value, entries))
+        size = 1 + sum(self._sizes.get(entry[0], 1) if type(entry) is list else 1 for entry in entries)
+        self._sizes[len(self._parts)] = size
+        self._visits += size
+        if self._visits > MOST_VISITS:
+            raise ValueError("parts that are shared too often")
+        return values
+
     def _built(self, tag: str, entries: list[Any]) -> Any:
         """Return the value of a row."""
         if tag == "array":
             return self._array(*entries)
         if tag == "dict":
-            values = list(map(self._value, entries))
+            values = self._values(entries)
             return dict(zip(values[::2], values[1::2], strict=True))
         if tag in BUILT:
-            return BUILT[tag](list(map(self._value, entries)))
+            return BUILT[tag](self._values(entries))
         (first, *rest) = entries
         if tag == "int":
             return int(first, 16)

@@ -107,12 +107,10 @@ class RunConfig(ExperimentConfig):
     def decision_ticks(self) -> int | None:
         """Ticks between decisions of a trained policy, as in its training; None for other policies: the default."""
         from agents.registry import is_model
-        from agents.trained import load_model
-        from vslam_env.config import EnvConfig
 
         if not is_model(self.policy):
             return None
-        trained = EnvConfig.from_toml_text(load_model(self.policy)[1]["environment"])
+        trained = training_environment(self.policy, "policy")
         return None if self.action_type != "goal" else trained.decision_ticks
 
     @property
@@ -177,3 +175,28 @@ class RunConfig(ExperimentConfig):
 
         policies = {agent: make_policy(self.policy, self.action_type) for agent in env.possible_agents}
         return GuardedTeam(policies, self.policy, self.action_type, self.decision_limit)
+
+
+def training_environment(path: str, argument: str) -> "EnvConfig":
+    """Return the environment in which a model was trained.
+
+    Args:
+        path: Path of the model, or of the run folder that contains it.
+        argument: Name of the path in errors.
+
+    Raises:
+        ValueError: If the model cannot be read, or its environment cannot be made.
+    """
+    from agents.trained import load_model
+    from slam_backend.core.validation import argument_error
+    from vslam_env.config import EnvConfig
+
+    text = load_model(path, argument)[1]["environment"]
+    try:
+        config = EnvConfig.from_toml_text(text)
+        if config.action_type != "goal":
+            raise argument_error("action_type", "goal, as vslam train has it", config.action_type, "Check the model.")
+        return config
+    except ValueError as error:
+        hint = f"Train again, {str(path)!r} cannot be used: {error}"
+        raise argument_error(argument, "a model of an environment of this version", "another one", hint) from error

@@ -256,11 +256,10 @@ class EvaluateConfig(ExperimentConfig):
         Raises:
             ValueError: If the model cannot be read, or its environment is not supported.
         """
-        from agents.trained import load_model
-        from vslam_env.config import EnvConfig
+        from training.episodes.config import training_environment
         from vslam_env.world import is_single_layout
 
-        config = EnvConfig.from_toml_text(load_model(self.model)[1]["environment"])
+        config = training_environment(self.model, "model")
         given = {
             "world": self.world, "num_robots": self.robots, "max_cycles": self.max_cycles,
             "max_seconds": self.max_seconds,

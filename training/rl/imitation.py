@@ -129,7 +129,7 @@ def read_labels(file: Path, about: Mapping[str, Any]) -> Labels:
     """
     expected = "labels that vslam train wrote"
     if not file.is_file():
-        raise argument_error("labels", expected, "no such file", f"Check {str(file)!r}.")
+        raise argument_error("labels", expected, "no such file", f"Copy {str(file)!r} again, or use another folder.")
     try:
         arrays = dict(read_arrays(file))
         found = json.loads(str(arrays.pop(ABOUT)))
@@ -160,6 +160,8 @@ def joined(parts: Sequence[Labels]) -> Labels:
 
 def _unpacked(arrays: Mapping[str, NDArray[Any]]) -> Labels:
     """Return the labels of the arrays in a file."""
+    if arrays["chosen"].dtype.kind not in "iu" or arrays["preferences"].dtype.kind != "f":
+        raise ValueError("labels of another type")
     chosen, preferences = arrays["chosen"].astype(np.int64), arrays["preferences"].astype(np.float32)
     n, num_actions = len(chosen), SHAPES["action_mask"][0]
     if preferences.shape != (n, num_actions) or chosen.ndim != 1 or ((chosen < 0) | (chosen >= num_actions)).any():
@@ -440,6 +442,8 @@ class Imitation:
     def _labels(self, number: int, part: int, split: str, on_progress: Progress) -> Labels:
         """Return the labels of a file, collected first unless the checkpoint says that they were.
 
+        A lost file is collected again where its driver is at hand: the teacher, or a pupil that has not learned since.
+
         Raises:
             ValueError: If the file is missing or damaged, or of another run.
         """
@@ -447,7 +451,8 @@ class Imitation:
         file = self._folder / LABELS / f"{name}.npz"
         env_configs = config.make_env_configs(split)
         about = {"environment": [each.to_toml() for each in env_configs], "seed": config.seed, "file": name}
-        if name not in self._returns:
+        has_driver = number in (0, len(self.rows) / config.epochs)
+        if name not in self._returns or (has_driver and not file.is_file()):
             file.parent.mkdir(exist_ok=True)
             if split not in self._envs:
                 self.close()

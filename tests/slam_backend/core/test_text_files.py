@@ -1,5 +1,6 @@
 """The reader of users' text files: encodings, limits, and places in errors."""
 
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,17 @@ def test_size_is_limited(tmp_path: Path) -> None:
         stream.truncate((1 << 20) + 1)
     with pytest.raises(ValueError, match="at most 1 MiB"):
         read_text(file, most_megabytes=1)
+
+
+def test_reading_takes_memory_for_the_file_and_not_for_its_limit(tmp_path: Path) -> None:
+    """A file of two bytes that may have a GiB is read in less than a MiB."""
+    (tmp_path / "a.txt").write_text("ab")
+    tracemalloc.start()
+    try:
+        assert read_text(tmp_path / "a.txt", most_megabytes=1024) == "ab"
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
@@ -99,10 +111,15 @@ def test_bad_json(tmp_path: Path, text: str, message: str) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("a = 1 2", "line 1, column 7 of b.toml"), ("a = " + "[" * 20_000, "nested too deeply"), ("a = ", "b.toml")],
+    [
+        ("a = 1 2", "line 1, column 7 of b.toml"),
+        ("a = " + "[" * 20_000, "nested too deeply"),
+        ("a = ", "b.toml"),
+        ("a = " + "9" * 5000, "Exceeds the limit"),
+    ],
 )
 def test_bad_toml(text: str, message: str) -> None:
-    """Malformed and deeply nested TOML is refused in one line with its place."""
+    """Malformed and deeply nested TOML, and ints of thousands of digits, are refused in one line with its place."""
     with pytest.raises(ValueError, match="config: expected a file in TOML") as caught:
         parse_toml(text, "config", "b.toml")
     assert message in str(caught.value)

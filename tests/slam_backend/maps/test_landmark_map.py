@@ -147,6 +147,9 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="got a broken file"):
         LandmarkMap.load(foreign)
     assert not proof.exists()
+    np.savez(foreign, **fields(), format=np.array("vslam landmark map"), version=np.array(np.inf))
+    with pytest.raises(ValueError, match="got a broken file"):
+        LandmarkMap.load(foreign)
     newer = fields() | {"format": np.array("vslam landmark map"), "version": np.array(2)}
     np.savez(foreign, **newer)
     with pytest.raises(ValueError, match="expected 'vslam landmark map' version 1, got 'vslam landmark map' version 2"):

@@ -176,6 +176,15 @@ def test_forged_bytes_are_refused(forged: bytes) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000  # kB
 
 
+@pytest.mark.parametrize("last", [["set", [60]], ["dict", [60], 1], ["list", [60]]])
+def test_parts_that_are_shared_too_often_are_refused(last: list[Any]) -> None:
+    """A pair of a pair of ..., sixty deep, is 61 rows and 2^60 parts: it is refused before it is hashed or checked."""
+    rows = [["tuple", 1], *(["tuple", [i], [i]] for i in range(60)), last]
+    table = json.dumps([rows, [61]]).encode()
+    with pytest.raises(ValueError, match="shared too often"):
+        decode(f"{len(table)}\n".encode() + table)
+
+
 def test_flipped_bytes_are_refused_or_read() -> None:
     """Each flipped byte of a filter's state raises a ValueError, or gives a state that is refused or accepted."""
     content = encode(FastSlam(1, num_particles=4).get_state())

@@ -101,9 +101,9 @@ def test_finished_trials_survive_a_full_disk(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_write_errors_of_libraries_are_one_line(number: int, refusal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A system error about space, from any library, is reported; any other error keeps its traceback."""
+    """An error about space or memory, from any library, is reported; any other error keeps its traceback."""
 
-    def app(raised: OSError) -> Callable[[str], None]:
+    def app(raised: Exception) -> Callable[[str], None]:
         def fail(prog_name: str) -> None:
             raise raised
 
@@ -112,6 +112,8 @@ def test_write_errors_of_libraries_are_one_line(number: int, refusal: Any, monke
     monkeypatch.setattr(cli, "app", app(OSError(number, os.strerror(number), "events")))
     text = f"output: expected a disk with free space, got 'events'. The system says: {os.strerror(number)}."
     assert refusal("anything") == f"error {text}\n"
+    monkeypatch.setattr(cli, "app", app(MemoryError()))
+    assert refusal("anything") == "error memory: expected more of it, got none left. Use less, or raise ulimit -v.\n"
     monkeypatch.setattr(cli, "app", app(ConnectionError("another")))
     with pytest.raises(ConnectionError, match="another"):
         cli.main()

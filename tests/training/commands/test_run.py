@@ -13,6 +13,8 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from agents.registry import LEARNED
+from agents.trained import load_model, save_model
 from slam_backend.geometry import between, compose
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
@@ -424,3 +426,12 @@ def test_a_config_repeats_a_run_from_any_folder(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.chdir(tmp_path)
     assert RunConfig(world="plan.png").to_mapping()["world"] == str(tmp_path.resolve() / "plan.png")
     assert RunConfig(world="fig5").to_mapping()["world"] == "fig5"
+
+
+@pytest.mark.parametrize("text", ["", "[[[", "num_robots = 1000", "max_cycles = inf", "num_robots = " + "9" * 5000])
+def test_models_of_impossible_environments_are_refused(text: str, tmp_path: Path) -> None:
+    """An environment of a training that cannot be made is an error of the model, in one line."""
+    weights, about = load_model(LEARNED)
+    save_model(tmp_path / "model.npz", weights, about | {"environment": text})
+    with pytest.raises(ValueError, match=r"^policy: expected a model of .* Train again, .* cannot be used: .*\Z"):
+        RunConfig(policy=str(tmp_path), action_type="goal").environment()

@@ -138,7 +138,7 @@ def test_foreign_and_damaged_labels_are_refused(tmp_path: Path) -> None:
     for changed in (
         {"scan": arrays["scan"][:, :16]}, {"scan": arrays["scan"][0]}, {"preferences": arrays["preferences"][:, :17]},
         {"local_grid": arrays["local_grid"][:, :, :5]}, {"chosen": arrays["chosen"] + 33},
-        {"chosen": arrays["chosen"].astype(np.int64) - 99},
+        {"chosen": arrays["chosen"].astype(np.int64) - 99}, {"chosen": arrays["chosen"] * np.nan},
         {"preferences": arrays["preferences"] * np.float16(np.nan)}, {"scan": arrays["scan"] | np.uint8(0x7C)},
     ):  # fmt: skip
         np.savez(file, **arrays | changed)
@@ -256,15 +256,17 @@ def test_an_interrupted_imitation_ends_with_the_same_weights(
         np.testing.assert_array_equal(resumed.policy.actor_weights()[name], values)
 
 
-def test_lost_labels_and_other_checkpoints_are_refused(tmp_path: Path) -> None:
-    """A file of labels that the checkpoint counts must be there; a checkpoint cut in half is refused."""
+def test_lost_labels_are_collected_again_and_other_checkpoints_refused(tmp_path: Path) -> None:
+    """Lost labels of the teacher are collected again when a run resumes, to the byte; half a checkpoint is refused."""
     _run(tmp_path / "run", 4)
     file = tmp_path / "run" / LABELS / "00-train-000.npz"
     kept = file.read_bytes()
+    file.write_bytes(kept[:99])
+    with pytest.raises(ValueError, match=r"labels: expected .*, got a broken file\. .* Delete it"):
+        _run(tmp_path / "run", 1)
     file.unlink()
-    with pytest.raises(ValueError, match="labels: expected labels that vslam train wrote, got no such file"):
-        _run(tmp_path / "run")
-    file.write_bytes(kept)
+    _run(tmp_path / "run", 1)
+    assert file.read_bytes() == kept
     checkpoint = tmp_path / "run" / CHECKPOINT_FILE
     content = checkpoint.read_bytes()
     checkpoint.write_bytes(content[: len(content) // 2])
