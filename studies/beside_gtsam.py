@@ -25,6 +25,7 @@ from slam_backend.trajectory import Trajectory
 from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, first_seed, option
 from training.experiments.study import Column, ResultTable, Study
+from training.experiments.trial_store import FAILED
 from training.replay.config import KITTI, MRCLAM, VICTORIA, MrclamConfig, find_log
 from training.replay.core import SingleFilter, make_filters
 from training.replay.log import Log, RobotLog
@@ -35,6 +36,7 @@ from vslam_env.belief.readings import Readings
 Method = Literal["filter", "isam2", "batch"]
 METHODS: tuple[Method, ...] = ("filter", "isam2", "batch")
 LEAST_SIGMA = 1e-4  # [m, rad]; lower limit of claimed standard deviations: robots at their start know their pose
+LEAST_BIAS = 1e-3  # of biases that are not modelled: smaller ones make the equations ill-conditioned
 
 # ---------------------------------------------------------------------- trials
 
@@ -214,10 +216,10 @@ class Graph:
             pose = compose(before, readings.odometry[step])
             factors.add(self._motion(step))
         else:
-            exact = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+            exact = gtsam.noiseModel.Isotropic.Sigma(3, LEAST_SIGMA)
             factors.add(gtsam.PriorFactorPose2(self.pose(0), gtsam.Pose2(), exact))
             if readings.motion.is_biased:
-                sigmas = np.maximum(np.sqrt(np.diag(readings.motion.bias_covariance)), 1e-6)
+                sigmas = np.maximum(np.sqrt(np.diag(readings.motion.bias_covariance)), LEAST_BIAS)
                 factors.add(gtsam.PriorFactorVector(self.bias, np.zeros(3), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
                 values.insert(self.bias, np.zeros(3))
         values.insert(self.pose(step), gtsam.Pose2(*pose))
@@ -278,7 +280,7 @@ class Graph:
             seen = camera.camera_from_robot(local)
             by_seen = np.eye(3)
             if covariance is None:
-                seen[2] = max(seen[2], 1e-3)  # behind the camera there is no picture
+                seen[2] = max(seen[2], 0.5 * point[2])  # nearer, and behind the camera, pixels say nothing
                 scale = camera.focal_px / seen[2]
                 by_seen = scale * np.array([
                     [1.0, 0.0, -seen[0] / seen[2]], [0.0, 1.0, -seen[1] / seen[2]],
@@ -350,14 +352,18 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
 
     Returns:
         `position_rms_m` over the steps with known truth, after an SE(2) fit for real logs; `nees_median` (ideal 2.4)
-        of the poses, if true headings are known; processor time `step_ms`; `measurements` used.
+        of the poses, if true headings are known; processor time `step_ms`; `measurements` used. If GTSAM gives up, its
+        words as `failed` alone.
     """
     key = config, trial.log, trial.world, trial.seed
     log, readings, estimate = filtered(*key)
     if trial.method != "filter":
-        estimate, every, values = optimised(*key)
-        if trial.method == "batch":
-            estimate = batch(readings, every, values)
+        try:
+            estimate, every, values = optimised(*key)
+            if trial.method == "batch":
+                estimate = batch(readings, every, values)
+        except RuntimeError as error:
+            return {FAILED: str(error).strip().splitlines()[0]}
     rms, median = scores(log, estimate, fitted=not trial.world)
     return {
         "position_rms_m": rms, "nees_median": median, "step_ms": estimate.step_ms,
