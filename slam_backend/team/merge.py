@@ -190,8 +190,11 @@ class Trial:
                 pairing = plan.pair_particles(merging, team.rng)
                 relative = transform_uncertainty(plan, pairing)
             else:
-                plan, relative = plan.with_motion(start), relative_uncertainty(start.covariance)
-            alignment, uncertainty = plan.alignment, merging.min_sigmas * relative
+                relative = relative_uncertainty(start.covariance)
+            uncertainty = merging.min_sigmas * relative
+            if start is not None and uncertainty <= 1.0:
+                plan = plan.with_motion(start)
+            alignment = plan.alignment
             if team.schedule.should_defer(key, uncertainty):
                 alignment = Alignment.refused("too uncertain", alignment.ratio, "paths", uncertainty)
         team.schedule.record(key, team.step, alignment.success, self.unsmoothed is not None)
