@@ -77,7 +77,7 @@ BAD: dict[str, dict[str, str]] = {
         "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
         "--policies no_module:Missing": "policy: expected MODULE:NAME of a policy, got no module 'no_module'.",
         "--policies random_walk@goal": "random_walk@: expected one of 'continuous', 'discrete', 'team', got 'goal'.",
-        "--policies none.npz": "model: expected a model that vslam train wrote, got no such file.",
+        "--policies none.npz": "policy: expected a model that vslam train wrote, got no such file.",
         "--worlds nowhere": "world: expected",
         "--robots 9": f"{ROBOTS} 9.",
     },
