@@ -30,7 +30,7 @@ LEAST_WINDOWS = 20  # fewest windows for a diagnosis
 ANY_HEIGHT = 1e12  # [m^2]; robots may pitch, so that heights tell nothing
 LEAST_COMMON = 2  # landmarks of a window; two determine a planar motion
 CLEAR = 0.8  # largest ratio of the distances to the nearest descriptor and to the second one
-STILL = 0.02  # of the way and turns that the sightings tell; less odometry in total is none
+STILL = 0.02  # of the distance and turns that the sightings tell; less odometry in total is none
 SURE = 4.0  # standard errors of a ratio beyond which it differs from one
 NOTICED = 0.15  # of a ratio; smaller differences are no mistake of the set-up
 UNITS = {"centimetres": 100.0, "millimetres": 1000.0}
@@ -67,8 +67,8 @@ CAUSES = {  # what is said of each cause; `{ratio}` is what was found
     "rotated axes": "The robot moves at {ratio:.0f} degrees to what the sightings tell: the axes of odometry and points"
     " differ.",
     "odometry in degrees": "Turns are {ratio:.1f} times those of the sightings: give radians, not degrees.",
-    "odometry in centimetres": "Ways are {ratio:.0f} times those of the sightings: give the odometry in metres.",
-    "odometry in millimetres": "Ways are {ratio:.0f} times those of the sightings: give the odometry in metres.",
+    "odometry in centimetres": "Distances are {ratio:.0f} times those of the sightings: give the odometry in metres.",
+    "odometry in millimetres": "Distances are {ratio:.0f} times those of the sightings: give the odometry in metres.",
     "points in centimetres": "The sightings move {ratio:.0f} times as far as the odometry: give the points in metres.",
     "points in millimetres": "The sightings move {ratio:.0f} times as far as the odometry: give the points in metres.",
     "scale": "The sightings move {ratio:.2f} times as far as the odometry: check baseline, focal length and the "
@@ -89,15 +89,15 @@ class Motions:
     Attributes:
         sighted: (N, 3) float64 [m, m, rad]. Motion in the robot frame at the start of the window.
         covariances: (N, 3, 3) float64. Covariances of these motions by the assumed noise of the points.
-        ways: (N, 2) float64 [m]. Sum of the odometry's translations, each in its own robot frame.
+        translations: (N, 2) float64 [m]. Sum of the odometry's translations, each in its own robot frame.
         turns: (N,) float64 [rad]. Sum of the odometry's turns.
-        variances: (N, 2) float64 [m^2, rad^2]. Assumed variances of both sums, along the way and of the turn.
+        variances: (N, 2) float64 [m^2, rad^2]. Assumed variances of both sums, along the motion and of the turn.
         fits: (N,) float64 [-]. Median squared residual of the points, in units of their assumed noise.
     """
 
     sighted: FloatArray
     covariances: FloatArray
-    ways: FloatArray
+    translations: FloatArray
     turns: FloatArray
     variances: FloatArray
     fits: FloatArray
@@ -142,22 +142,23 @@ def find_motions(
     distances = np.hypot(*odometry[:, :2].T)
     rows, place = [], 0
     while place < len(seen):
-        first, later = seen[place], [step for step in seen[place + 1 :] if step <= seen[place] + WINDOW]
+        begun, first = place, seen[place]
+        later = [step for step in seen[begun + 1 : begun + 1 + WINDOW] if step <= first + WINDOW]
         place += 1
-        for last in reversed(later):
+        for count, last in reversed(list(enumerate(later, 1))):
             pairs = match(measurements, identities, first, last)
             if len(pairs) < LEAST_COMMON:
                 continue
-            between, way = slice(first + 1, last + 1), distances[first + 1 : last + 1].sum()
-            noise = motion.variances(odometry[between]).sum(axis=0)[[0, 2]] + bias[:2] * way**2
+            between = slice(first + 1, last + 1)
+            noise = motion.variances(odometry[between]).sum(axis=0)[[0, 2]] + bias[:2] * distances[between].sum() ** 2
             before, after = (_in_robot(measurements[step], camera) for step in (first, last))
             told = sighted_motion(before, after, pairs)
             rows.append((*told, odometry[between, :2].sum(axis=0), odometry[between, 2].sum(), noise))
-            place = seen.index(last)
+            place = begun + count
             break
-    sighted, covariances, fits, ways, turns, variances = zip(*rows, strict=True) if rows else ((),) * 6
+    sighted, covariances, fits, translations, turns, variances = zip(*rows, strict=True) if rows else ((),) * 6
     return Motions(
-        np.reshape(sighted, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), np.reshape(ways, (-1, 2)),
+        np.reshape(sighted, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), np.reshape(translations, (-1, 2)),
         np.array(turns, np.float64), np.reshape(variances, (-1, 2)), np.array(fits, np.float64),
     )  # fmt: skip
 
@@ -211,23 +212,25 @@ def _in_robot(frame: Measurements | None, camera: StereoCamera) -> tuple[FloatAr
 
 def name_causes(found: Motions) -> tuple[Cause, ...]:
     """Return what the motions over windows tell of the set-up."""
-    ways, turns, sighted_turns = np.hypot(*found.ways.T), found.turns, found.sighted[:, 2]
+    distances, turns, sighted_turns = np.hypot(*found.translations.T), found.turns, found.sighted[:, 2]
     told = np.array([np.hypot(*found.sighted[:, :2].T).sum(), np.abs(sighted_turns).sum()])
-    if (np.array([ways.sum(), np.abs(turns).sum()]) <= STILL * told).all():
+    if (np.array([distances.sum(), np.abs(turns).sum()]) <= STILL * told).all():
         return (_cause("frozen odometry", 0.0),)
     causes = []
     turn, turn_error, turn_spread = _ratio(turns, sighted_turns, found.variances[:, 1] + found.covariances[:, 2, 2])
-    axes = np.arctan2(found.ways[:, 1], found.ways[:, 0]) + 0.5 * sighted_turns  # of the chord's middle
+    axes = np.arctan2(found.translations[:, 1], found.translations[:, 0]) + 0.5 * sighted_turns  # of the chord's middle
     along = np.column_stack([np.cos(axes), np.sin(axes)])
     chords = found.sighted[:, :2]
     off = np.arctan2(chords[:, 1], chords[:, 0]) - axes
-    weights = ways * np.hypot(*chords.T)
+    weights = distances * np.hypot(*chords.T)
     mean = np.sum(weights * np.exp(1j * off)) / max(weights.sum(), 1e-12)
     turned = float(np.angle(mean)) if abs(mean) > AGREED else 0.0
     direction, opposite = abs(turned), turn < 0.0 and abs(turn) > SURE * turn_error
     along = along @ rotation(turned).T
     spread = np.einsum("ni,nij,nj->n", along, found.covariances[:, :2, :2], along)
-    way, way_error, way_spread = _ratio(ways, (chords * along).sum(axis=1), found.variances[:, 0] + spread)
+    length, length_error, length_spread = _ratio(
+        distances, (chords * along).sum(axis=1), found.variances[:, 0] + spread
+    )
     if direction > 0.75 * math.pi:
         causes.append(_cause("mirrored x" if opposite else "rotated axes", 180.0))
     elif direction > 0.25 * math.pi:
@@ -238,7 +241,7 @@ def name_causes(found: Motions) -> tuple[Cause, ...]:
     variances = turn**2 * found.variances[:, 1] + max(1.0, fit**2) * found.covariances[:, 2, 2]
     rest = (sighted_turns - turn * turns) ** 2 / variances
     noise = math.sqrt(float(np.median(rest)) / HALF_CHI_SQUARE)
-    causes += _of_turns(abs(turn), turn_error, turn_spread) + _of_ways(way, way_error, way_spread)
+    causes += _of_turns(abs(turn), turn_error, turn_spread) + _of_distances(length, length_error, length_spread)
     if fit > NOISY_POINTS or noise > NOISY:  # readings that say little tell no scale
         causes = [cause for cause in causes if not cause.name.startswith("scale")]
     if fit > NOISY_POINTS and not causes:
@@ -257,8 +260,8 @@ def _of_turns(ratio: float, error: float, spread: float) -> list[Cause]:
     return [_cause("scale of turns", ratio)] if spread < MOST_SPREAD * ratio else []
 
 
-def _of_ways(ratio: float, error: float, spread: float) -> list[Cause]:
-    """Return the cause of a ratio of ways, sightings over odometry."""
+def _of_distances(ratio: float, error: float, spread: float) -> list[Cause]:
+    """Return the cause of a ratio of distances, sightings over odometry."""
     if not _differs(ratio, error):
         return []
     for unit, size in UNITS.items():

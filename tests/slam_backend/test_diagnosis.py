@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from slam_backend.diagnosis import CAUSES, diagnose, find_motions
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
+from studies import mistakes
 from studies.mistakes import MOTION, Mistake, circle_log
 
 
@@ -28,7 +29,7 @@ def test_a_mistake_is_named_alone(mistake: Mistake, by_names: bool) -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.5, 2.0), st.integers(0, 1000))
 def test_scales_are_measured(scale: float, seed: int) -> None:
-    """The ratio of ways is that by which the odometry is wrong, to 3 %; below 15 % it is no mistake."""
+    """The ratio of distances is that by which the odometry is wrong, to 3 %; below 15 % it is no mistake."""
     log = circle_log("none", seed)
     odometry = log.odometry * [1.0 / scale, 1.0 / scale, 1.0]
     found = diagnose(odometry, log.measurements, log.identities, motion=MOTION)
@@ -40,15 +41,18 @@ def test_scales_are_measured(scale: float, seed: int) -> None:
         assert found == ()
 
 
-def test_motions_are_those_of_the_robot() -> None:
-    """Without noise the sightings tell the motion between two frames exactly, and their points fit."""
+def test_motions_are_those_of_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without noise the sightings tell the motion over each window exactly, and their points fit."""
+    monkeypatch.setattr(mistakes, "POINT_NOISE", 0.0)
     log = circle_log("none", 3)
-    clean = circle_log("none", 3)
-    camera = StereoCamera()
-    found = find_motions(clean.odometry, clean.measurements, log.identities, camera, MOTION)
-    assert len(found.turns) > 20
-    turns = np.median(found.sighted[:, 2] / found.turns)
-    assert turns == pytest.approx(1.0 / 1.02, abs=0.02)
+    found = find_motions(log.odometry, log.measurements, log.identities, StereoCamera(), MOTION)
+    assert len(found.turns) == 30
+    steps = np.round(found.sighted[:, 2] / mistakes.MOVE[2])
+    assert ((steps >= 9.0) & (steps <= 10.0)).all()
+    np.testing.assert_allclose(found.sighted[:, 2], steps * mistakes.MOVE[2], atol=1e-9)
+    chords = 2.0 * 4.0 * np.sin(0.5 * found.sighted[:, 2])
+    np.testing.assert_allclose(np.hypot(*found.sighted[:, :2].T), chords, rtol=1e-3)  # the circle is a polygon
+    assert found.fits.max() < 1e-9
 
 
 def test_logs_that_tell_nothing_get_no_word() -> None:
