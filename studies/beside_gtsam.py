@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 from itertools import product
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -45,7 +46,8 @@ class Config(ExperimentConfig):
     """Real logs below the folder VSLAM_DATA, and episodes of one robot."""
 
     logs: tuple[str, ...] = option(
-        ("victoria", "mrclam:1", "mrclam:2", "mrclam:3", "mrclam:4", "mrclam:5", "kitti"), "Real logs; mrclam:ROBOT.",
+        ("victoria", "mrclam:1", "mrclam:2", "mrclam:3", "mrclam:4", "mrclam:5", "mrclam4:3", "kitti"),
+        "Real logs; mrclam:ROBOT: data set 7, mrclam4:3: robot 3 of data set 4.",
         shown="all",
     )  # fmt: skip
     duration: float | None = option(None, "Duration of each real log [s].", shown="all", gt=0.0, hint="Give seconds.")
@@ -84,11 +86,15 @@ def log_of(config: Config, trial: Trial) -> Log:
     if name == "mrclam" and number.isdecimal():
         place = find_log(None, MRCLAM, "the folder of MR.CLAM data set 7")
         return read_mrclam(place, robots=(int(number),), duration=config.duration, alone=True)
+    if trial.log == "mrclam4:3":
+        place = find_log(None, MRCLAM.with_name("MRCLAM_Dataset4"), "the folder of MR.CLAM data set 4")
+        truth = find_log(None, Path("mrclam_extra_gt", "D4_robot3", "Groundtruth.csv"), "the true poses of its robot 3")
+        return read_mrclam(place, robots=(3,), duration=config.duration, truth=truth)
     if trial.log == "victoria":
         return read_victoria(find_log(None, VICTORIA, "the folder of Victoria Park"), duration=config.duration)
     if trial.log == "kitti":
         return read_kitti(find_log(None, KITTI, "the folder of tracked features"), duration=config.duration)
-    raise argument_error("logs", "victoria, kitti or mrclam:ROBOT", trial.log, "Name one of them.")
+    raise argument_error("logs", "victoria, kitti, mrclam:ROBOT or mrclam4:3", trial.log, "Name one of them.")
 
 
 def episode_log(config: Config, trial: Trial) -> Log:
@@ -190,7 +196,10 @@ def one_thread() -> Iterator[None]:
 
 
 class Graph:
-    """Factors of GTSAM: `Pose2` keys for the steps, `Point3` landmarks, and an odometry bias if the model has one."""
+    """Factors of GTSAM: `Pose2` keys for the steps, landmarks, and an odometry bias if the model has one.
+
+    Landmarks are `Point2` where measurements have covariances, which are those of planar logs, and else `Point3`.
+    """
 
     def __init__(self, readings: Used) -> None:
         import gtsam
@@ -229,12 +238,16 @@ class Graph:
             for n in np.flatnonzero(used):
                 label = int(readings.labels[step][n])
                 covariance = None if frame.covariances is None else frame.covariances[n]
-                factors.add(self._sight(step, label, frame.points[n], covariance))
+                ahead = readings.camera.robot_from_camera(frame.points[n])
+                if covariance is None:
+                    factors.add(self._sight(step, label, frame.points[n]))
+                else:
+                    factors.add(self._planar_sight(step, label, ahead[:2], covariance))
                 if label not in self.known:
                     self.known.add(label)
-                    ahead = readings.camera.robot_from_camera(frame.points[n])
                     place = compose(pose, np.array([ahead[0], ahead[1], 0.0]))
-                    values.insert(self.landmark(label), np.array([place[0], place[1], ahead[2]]))
+                    place[2] = ahead[2]
+                    values.insert(self.landmark(label), place if covariance is None else place[:2])
         return factors, values
 
     def landmark(self, label: int) -> int:
@@ -265,12 +278,21 @@ class Graph:
 
         return gtsam.CustomFactor(noise, [*keys, self.bias], error)
 
-    def _sight(self, step: int, label: int, point: FloatArray, covariance: FloatArray | None) -> Any:
-        """Return the factor of a measured point (3,), camera frame, by its covariance or the noise of the pixels."""
-        gtsam, camera = self.gtsam, self.readings.camera
+    def _planar_sight(self, step: int, label: int, ahead: FloatArray, covariance: FloatArray) -> Any:
+        """Return the factor of a point (2,), robot frame, with its covariance (3, 3) in the camera frame."""
+        gtsam, distance = self.gtsam, float(np.hypot(*ahead))
+        x, y = ahead / distance
+        polar = np.array([[-y / distance, x / distance], [x, y]]) @ ROBOT_FROM_CAMERA[:2]  # of bearing and range
+        return gtsam.BearingRangeFactor2D(
+            self.pose(step), self.landmark(label), gtsam.Rot2(np.arctan2(y, x)), distance,
+            gtsam.noiseModel.Gaussian.Covariance(polar @ covariance @ polar.T),
+        )  # fmt: skip
+
+    def _sight(self, step: int, label: int, point: FloatArray) -> Any:
+        """Return the factor of a measured point (3,), camera frame, with the noise of its pixels."""
+        camera = self.readings.camera
         keys = [self.pose(step), self.landmark(label)]
-        noise = self.pixels if covariance is None else gtsam.noiseModel.Gaussian.Covariance(covariance)
-        measured = point if covariance is not None else camera.project(point)
+        measured = camera.project(point)
 
         def error(this: Any, values: Any, jacobians: Any) -> FloatArray:
             pose, landmark = values.atPose2(keys[0]), values.atPoint3(keys[1])
@@ -278,22 +300,20 @@ class Graph:
             dx, dy = landmark[0] - pose.x(), landmark[1] - pose.y()
             local = np.array([cos * dx + sin * dy, cos * dy - sin * dx, landmark[2]])
             seen = camera.camera_from_robot(local)
-            by_seen = np.eye(3)
-            if covariance is None:
-                seen[2] = max(seen[2], 0.5 * point[2])  # nearer, and behind the camera, pixels say nothing
+            seen[2] = max(seen[2], 0.5 * point[2])  # nearer, and behind the camera, pixels say nothing
+            if jacobians is not None:
                 scale = camera.focal_px / seen[2]
                 by_seen = scale * np.array([
                     [1.0, 0.0, -seen[0] / seen[2]], [0.0, 1.0, -seen[1] / seen[2]],
                     [0.0, 0.0, -camera.baseline / seen[2]],
                 ])  # fmt: skip
-            if jacobians is not None:
                 by_local = by_seen @ ROBOT_FROM_CAMERA.T
                 by_pose = np.array([[-1.0, 0.0, local[1]], [0.0, -1.0, -local[0]], [0.0, 0.0, 0.0]])
                 jacobians[0] = by_local @ by_pose
                 jacobians[1] = by_local @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-            return np.asarray((seen if covariance is not None else camera.project(seen)) - measured)
+            return np.asarray(camera.project(seen) - measured)
 
-        return gtsam.CustomFactor(noise, keys, error)
+        return self.gtsam.CustomFactor(self.pixels, keys, error)
 
 
 def _as_pose(pose: Any) -> FloatArray:
@@ -409,8 +429,8 @@ STUDY = Study(
     about="""Compare the filter with GTSAM's iSAM2 and batch optimiser on the same measurements, matches and noise.
 
     Real logs, and episodes of one robot with true identities. All methods get the measurements that the filter used,
-    with the landmarks that it associated them with, and assume the same noise. Measurement factors of GTSAM are
-    written in Python, so that its times are upper limits.
+    with the landmarks that it associated them with, and assume the same noise. Stereo measurements and biases of
+    odometry are factors written in Python, so that GTSAM's times in episodes and on KITTI are upper limits.
     """,
     config=Config,
     trial=Trial,
