@@ -98,7 +98,7 @@ def test_errors_are_relative_to_the_bound_and_refusals_are_failures() -> None:
     """Errors are RMS over the root of the mean bound; a refused trial is a failure without error."""
     rows = [row(), row(error_m=0.04, error_rad=0.003), refusal("ambiguous")]
     line, pooled = STUDY.tables[0].lines(rows)
-    assert line["right [%]"].value == pytest.approx(2 / 3)
+    assert line["right [%]"].value == pytest.approx(200 / 3)
     assert line["translation/bound"].value == pytest.approx(np.sqrt(0.5 * (0.02**2 + 0.04**2)) / 0.02)
     assert line["rotation/bound"].value == pytest.approx(np.sqrt(5.0))
     anees = line["ANEES (consistent)"]

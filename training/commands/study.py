@@ -110,13 +110,16 @@ def write_tables(
 
 
 def print_table(console: Console, table: "ResultTable", lines: Sequence[dict[str, Any]]) -> None:
-    """Print a table for a narrow console: units and intervals are on a second line."""
+    """Print a table for a narrow console: units and intervals are on a second line, and only texts are folded."""
     from training.experiments.tables import console_table
 
     for title, rows in table.parts(lines):
         headings = [heading.replace(" [", "\n[") for heading in table.headings]
         cells = [[re.sub(r" \((\S+) \.\. (\S+)\)$", r"\n\1..\2", text) for text in row] for row in rows]
-        console.print(console_table(title, headings, cells))
+        shown = console_table(title, headings, cells)
+        for column, texts in zip(shown.columns[1:], list(zip(*cells, strict=True))[1:], strict=True):
+            column.no_wrap = not any(" " in text for text in texts)
+        console.print(shown)
     if table.note:
         console.print(table.note)
 

@@ -39,6 +39,7 @@ class Estimate(NamedTuple):
 STATISTICS: dict[str, Callable[..., Any]] = {
     "mean": np.mean, "median": np.median, "worst": np.max, "sum": np.sum,
     "geometric mean": gmean, "p95": lambda values, axis=None: np.quantile(values, 0.95, axis=axis),
+    "share above 0": lambda values, axis=None: np.mean(values > 0.0, axis=axis),
 }  # fmt: skip
 Statistic = str | Callable[[Sequence[Row]], Any]
 Words = Mapping[str, tuple[str, Callable[[Any], str]]]  # headings of fields, and texts of their values
@@ -76,23 +77,34 @@ class Column:
         words, unit, _ = in_words(self.name)
         return self.heading or (f"{words} [{unit}]" if unit else words)
 
+    @property
+    def scale(self) -> float:
+        """Factor from the values of the rows to those shown."""
+        return in_words(self.name)[2] if self.factor is None else self.factor
+
     def estimate(self, rows: Sequence[Row]) -> Estimate:
-        """Return the statistic of some rows."""
+        """Return the statistic of some rows, in the unit of the title."""
         if not isinstance(self.statistic, str):
             found = self.statistic(rows)
-            return found if isinstance(found, Estimate) else Estimate(found)
+            return self.scaled(found if isinstance(found, Estimate) else Estimate(found))
         values = np.array([row[self.name] for row in rows if row.get(self.name) is not None], np.float64)
         if not len(values):
             return Estimate(None)
         statistic = STATISTICS[self.statistic]
-        return Estimate(float(statistic(values)), *(interval(values, statistic) if self.interval else (None, None)))
+        ends = interval(values, statistic) if self.interval else (None, None)
+        return self.scaled(Estimate(float(statistic(values)), *ends))
+
+    def scaled(self, found: Estimate) -> Estimate:
+        """Return an estimate in the unit of the title."""
+        if isinstance(found.value, str) or self.scale == 1.0:
+            return found
+        return Estimate(*(None if value is None else self.scale * value for value in found))
 
     def text(self, found: Estimate) -> str:
         """Return an estimate as the text of a cell."""
         if isinstance(found.value, str):
             return found.value
-        factor = in_words(self.name)[2] if self.factor is None else self.factor
-        text, *ends = (number(value, self.digits, factor) for value in found)
+        text, *ends = (number(value, self.digits) for value in found)
         return text if found.low is None else f"{text} ({' .. '.join(ends)})"
 
 
@@ -109,7 +121,7 @@ class ResultTable:
         pooled: Fields over whose values there are further lines.
         each: Fields with a table for each combination of their values, which its title names.
         against: Field over whose values lines are compared, by the differences of `training.experiments.statistics`;
-            empty: there is no comparison.
+            empty: there is no comparison. Functions of a column get the rows of the differences.
         base: Value to compare with; None: the first.
         note: Text below the title.
         words: Headings of fields, and texts of their values.
@@ -145,10 +157,10 @@ class ResultTable:
             yield ", ".join((self.title, *texts)), list(map(self.cells, group))
 
     def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
-        """Return a line for each group of rows in the order of first occurrence: the fields and `Estimate`s."""
+        """Return a line for each group of rows in the order of first occurrence: fields, and `Estimate`s by title."""
         chosen = list(filter(self.where, rows))
         if self.against:
-            names = [column.name for column in self.columns]
+            names = [column.name for column in self.columns if isinstance(column.statistic, str)]
             chosen = differences(chosen, names, self.by, self.against, self.base)
         groups = grouped(chosen, self.by)
         if self.pooled:

@@ -58,25 +58,24 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
 def draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
     """Draw a quantity over the field of the x axis, a line for each of some names; a level one where there is no x."""
     column = panel.column
-    factor = _factor(column)
     for place, name in enumerate(names):
         of_name = [row for row in rows if not chart.by or row[chart.by] == name]
         colour = COLOURS[place % len(COLOURS)]
         if of_name and all(row[chart.x] is None for row in of_name):
             level = column.estimate(of_name).value
             if level is not None:
-                ax.axhline(factor * level, lw=1.2, ls="--", color=colour, label=str(name))
+                ax.axhline(level, lw=1.2, ls="--", color=colour, label=str(name))
             continue
         groups = sorted(grouped(of_name, (chart.x,)).items())
         found = [(chart.factor * x, column.estimate(group)) for (x,), group in groups]
         known = [(x, estimate) for x, estimate in found if estimate.value is not None]
-        xs, values = [x for x, _ in known], [factor * estimate.value for _, estimate in known]
+        xs, values = [x for x, _ in known], [estimate.value for _, estimate in known]
         ax.plot(
             xs, values, marker=MARKERS[place % len(MARKERS)], ms=5, mfc="none", lw=1.2, color=colour, label=str(name)
         )
         for x, estimate in known:
             if estimate.low is not None and estimate.high is not None:
-                ax.plot([x, x], [factor * estimate.low, factor * estimate.high], color=colour, lw=0.8)
+                ax.plot([x, x], [estimate.low, estimate.high], color=colour, lw=0.8)
     if chart.log:
         ax.set_xscale("log")
         ax.set_xticks(sorted({chart.factor * row[chart.x] for row in rows if row[chart.x] is not None}))
@@ -127,7 +126,7 @@ def _draw_curve(ax: Axes, curves: Curves, column: Column, key: Any, place: int, 
     """Draw the mean of a group over time with its interval."""
     known = [line for line in group if line[column.name] is not None]
     times, style = [line["time_s"] for line in known], STYLES[place // len(COLOURS) % len(STYLES)]
-    colour, factor = COLOURS[place % len(COLOURS)], _factor(column)
+    colour, factor = COLOURS[place % len(COLOURS)], column.scale
     ax.plot(
         times, [factor * line[column.name] for line in known], lw=1.2, color=colour, ls=style,
         label=_label(curves, curves.by[len(curves.rows) :], key),
@@ -140,8 +139,3 @@ def _draw_curve(ax: Axes, curves: Curves, column: Column, key: Any, place: int, 
 def _label(curves: Curves, names: Sequence[str], values: Sequence[Any]) -> str:
     """Return values of fields as text."""
     return ", ".join(value_text(curves.words, *item) for item in zip(names, values, strict=True))
-
-
-def _factor(column: Column) -> float:
-    """Return the factor of the values that a column shows."""
-    return in_words(column.name)[2] if column.factor is None else column.factor

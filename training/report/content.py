@@ -4,6 +4,7 @@ import base64
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -287,7 +288,10 @@ def _number(text: str) -> float:
 
 
 def _tables(metrics: Mapping[str, Any]) -> Iterable[dict[str, Any]]:
-    """Yield a table for each list of rows in the metrics."""
+    """Yield the tables of a study, and a table for each list of rows in the metrics."""
+    for name, rows in dict(metrics.get("tables") or {}).items():
+        ends = [{re.sub(" (low|high)$", r"_\1", title): value for title, value in row.items()} for row in rows]
+        yield table(name.replace("_", " "), "", ends)
     for name, rows in metrics.items():
         if name in NOT_TABLES or not isinstance(rows, list) or not rows:
             continue

@@ -205,8 +205,8 @@ class EvaluateConfig(ExperimentConfig):
     policies: tuple[str, ...] = option(
         ("random_goals", "frontier"), "Baseline policies, comma-separated; LABEL= may come before each."
     )
-    split: Literal["validation", "test"] = option(
-        "validation", "Split of the worlds: validation or test.", name="world_split"
+    split: Literal["validation", "test"] | None = option(
+        None, "Split of the worlds: validation or test.", name="world_split", shown="validation"
     )
     world: str | None = option(None, "World family or path.", shown="as in the training")
     robots: int | None = option(None, "Number of robots, 1 to 8.", shown="as in the training")
@@ -254,8 +254,9 @@ class EvaluateConfig(ExperimentConfig):
         Policies observe all keys.
 
         Raises:
-            ValueError: If the model cannot be read, or its environment is not supported.
+            ValueError: If the model cannot be read, its environment is not supported, or a single layout has a split.
         """
+        from slam_backend.core.validation import argument_error
         from training.episodes.config import training_environment
         from vslam_env.world import is_single_layout
 
@@ -265,7 +266,11 @@ class EvaluateConfig(ExperimentConfig):
             "max_seconds": self.max_seconds,
         }  # fmt: skip
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        changes["world_split"] = None if is_single_layout(changes.get("world", config.world)) else self.split
+        has_splits = not is_single_layout(world := changes.get("world", config.world))
+        if self.split and not has_splits:
+            hint = "Omit --world-split: starts and noise differ from the training anyway."
+            raise argument_error("world_split", "a world family or folder", world, hint)
+        changes["world_split"] = (self.split or "validation") if has_splits else None
         return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False, observation_keys="all")
 
     def trials(self) -> list[EvaluateTrial]:

@@ -190,7 +190,7 @@ def test_policies_are_compared_with_the_first_on_common_seeds() -> None:
     rows += [_row("b", seed, mean_coverage=0.1 * seed + 0.2) for seed in (1, 2, 4, 9)]
     (line,) = _table("policies").lines(rows)
     assert (line["policy"], line["oracle"]) == ("b", "none")
-    np.testing.assert_allclose(line["over time [%]"], [0.2, 0.2, 0.2])
+    np.testing.assert_allclose(line["over time [%]"], [20.0, 20.0, 20.0])
     assert _table("policies").cells(line)[:3] == ["b", "none", "20.0 (20.0 .. 20.0)"]
     assert _table("oracles").lines(rows) == []
 
@@ -204,7 +204,7 @@ def test_oracles_are_compared_in_pairs() -> None:
     ]
     (line,) = _table("oracles").lines(rows)
     assert line["oracle"] == "all"
-    assert line["E [cm]"].value == pytest.approx(-0.05)
+    assert line["E [cm]"].value == pytest.approx(-5.0)
     assert line["pose [cm]"].value is None
     assert _table("policies").lines(rows) == []
 

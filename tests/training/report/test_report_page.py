@@ -151,6 +151,17 @@ def test_columns_have_words_units_and_three_digits() -> None:
     ]  # fmt: skip
 
 
+def test_tables_of_a_study_have_intervals_in_the_unit_of_their_headings(tmp_path: Path) -> None:
+    """The page of a study shows its tables as the console does, before its trials."""
+    folder = RunFolder.create(tmp_path / "run", "bench exploration", {}, 0)
+    line = {"policy": "a", "E [cm]": 25.0, "E [cm] low": 12.5, "E [cm] high": 37.5}
+    folder.write_metrics({"tables": {"maps": [line]}, "trials": [{"policy": "a", "map_error": 0.25}]})
+    tables = Page(write_report(folder.path).read_text()).data["tables"]
+    assert [made["title"] for made in tables] == ["maps", "trials"]
+    assert tables[0]["headings"] == ["policy", "E [cm]"]
+    assert tables[0]["rows"] == [[["a", "a"], ["25\n(12.5 .. 37.5)", 25.0]]]
+
+
 def test_tables_of_a_run_have_no_keys_as_headings(run: Path) -> None:
     """All columns of robots, merges, attempts and consistency have words, and no more than three digits."""
     tables = Page(write_report(run).read_text()).data["tables"]

@@ -10,58 +10,58 @@ import pytest
 from rich.console import Console
 
 from agents import POLICIES
+from training.commands.study import print_table
 from training.rl import config as learn_extra
 from training.rl.config import TrainConfig
 from training.rl.curves import first_and_last_tenth, running_mean, to_csv
-from training.rl.evaluation import FIGURES, leads, print_evaluation, summarise
+from training.rl.evaluation import LAST, STUDY
 
 
 def _row(policy: str, seed: int, gained: float) -> dict[str, Any]:
-    return {"policy": policy, "seed": seed} | dict.fromkeys(FIGURES, 0.5) | {"return": gained}
+    return {"policy": policy, "seed": seed} | dict.fromkeys(LAST, 0.5) | {"return": gained}
 
 
-def test_leads_are_paired_over_the_seeds_that_both_played() -> None:
-    """The lead is the mean of the differences on common seeds; other seeds do not count."""
+def test_policies_are_compared_with_the_model_on_common_seeds() -> None:
+    """Differences are means over the seeds that both played, with the share of seeds in which they are positive."""
     rows = [_row("model", seed, gained) for seed, gained in ((1, 0.4), (2, 0.1), (3, 9.0))]
     rows += [_row("frontier", seed, gained) for seed, gained in ((1, 0.2), (2, 0.3), (4, -9.0))]
-    (lead,) = leads(rows)
-    assert lead["over"] == "frontier"
-    assert lead["seeds"] == 2
-    assert lead["lead"] == pytest.approx(0.0)
-    assert lead["won"] == 0.5
-    assert lead["lead_low"] == pytest.approx(-0.2)
-    assert lead["lead_high"] == pytest.approx(0.2)
+    policies, differences = STUDY.tables
+    assert [line["policy"] for line in policies.lines(rows)] == ["model", "frontier"]
+    (line,) = differences.lines(rows)
+    assert (line["policy"], line["seeds"].value, line["higher in [%]"].value) == ("frontier", 2, 50.0)
+    np.testing.assert_allclose(line["return [m]"], [0.0, -0.2, 0.2], atol=1e-12)
 
 
 def test_equal_differences_have_an_interval_of_no_width() -> None:
-    """If the lead is the same on all seeds, whatever the returns, both ends of the interval are this lead."""
+    """If the difference is the same on all seeds, whatever the returns, both ends of its interval are this number."""
     rows = [_row(name, seed, seed + ahead) for seed in range(5) for name, ahead in (("model", 0.25), ("other", 0.0))]
-    (lead,) = leads(rows)
-    np.testing.assert_allclose([lead["lead"], lead["lead_low"], lead["lead_high"]], 0.25)
-    assert lead["won"] == 1.0
-    model, other = summarise(rows)
-    assert (model["policy"], other["policy"]) == ("model", "other")
-    assert model["return"] == pytest.approx(2.25)
-    assert model["return_low"] < 2.25 < model["return_high"]
+    policies, differences = STUDY.tables
+    (line,) = differences.lines(rows)
+    np.testing.assert_allclose(line["return [m]"], [-0.25, -0.25, -0.25])
+    assert line["higher in [%]"].value == 0.0
+    mean, low, high = policies.lines(rows)[0]["return [m]"]
+    assert mean == pytest.approx(2.25)
+    assert low < 2.25 < high
 
 
-@pytest.mark.parametrize(("split", "worlds"), [("test", "Worlds of the test split"), (None, "One building")])
-def test_the_table_fits_into_80_columns(split: str | None, worlds: str) -> None:
-    """Nothing is wrapped or cut on a terminal of 80 columns, with long names of policies, signs and hundreds."""
-    rows = [_row(name, seed, 0.01 * (seed - 9)) | {"distance": 123.45} for seed in range(20) for name in POLICIES]
-    rows += [_row("model", seed, -0.25) for seed in range(20)]
+def test_the_tables_fit_into_80_columns() -> None:
+    """No number is folded or cut on a terminal of 80 columns, with long names of policies, signs and hundreds."""
+    names = [*POLICIES, "model"]
+    rows = [_row(name, seed, 0.01 * (seed - 9)) | {"distance": 123.45} for seed in range(20) for name in names]
     console = Console(file=io.StringIO(), width=80)
-    print_evaluation(console, summarise(rows), [], split)
+    for table in STUDY.tables:
+        print_table(console, table, table.lines(rows))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "…" not in text
     assert all(line.count("..") in (0, 2) for line in text.splitlines())  # both intervals of a policy side by side
-    for part in ("random_goals", "-0.250..-0.250", "123.45", f"{worlds}, 20 episodes of each policy"):
+    assert text.count("-0.021..0.030  0.500..0.500") == len(names)
+    for part in ("random_goals", "123", "Paired differences to the model"):
         assert part in text
 
 
-def test_without_a_model_there_is_no_lead() -> None:
-    """Without an episode of the model there is no lead."""
-    assert leads([_row("frontier", 1, 0.2)]) == []
+def test_without_a_model_there_is_no_difference() -> None:
+    """Without an episode of the model there is nothing to compare with."""
+    assert STUDY.tables[1].lines([_row("frontier", 1, 0.2)]) == []
 
 
 def test_curves_have_a_line_per_rollout() -> None:

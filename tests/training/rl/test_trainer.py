@@ -319,12 +319,14 @@ def test_commands_train_resume_evaluate_and_run(tmp_path: Path, monkeypatch: pyt
     result = runner.invoke(app, ["evaluate", str(out), "--seeds", "2", "--first-seed", "100", "--out", str(tried)])
     assert result.exit_code == 0, result.output
     metrics = json.loads((tried / "metrics.json").read_text())
-    assert [line["policy"] for line in metrics["policies"]] == ["model", "random_goals", "frontier"]
+    tables = metrics["tables"]
+    assert [line["policy"] for line in tables["policies"]] == ["model", "random_goals", "frontier"]
+    assert [line["policy"] for line in tables["differences"]] == ["random_goals", "frontier"]
     returns = {(row["policy"], row["seed"]): row["return"] for row in metrics["trials"]}
-    for lead in metrics["leads"]:
-        gaps = [returns["model", seed] - returns[lead["over"], seed] for seed in (100, 101)]
-        assert lead["lead"] == pytest.approx(np.mean(gaps))
-        assert lead["lead_low"] <= lead["lead"] <= lead["lead_high"]
+    for line in tables["differences"]:
+        gaps = [returns[line["policy"], seed] - returns["model", seed] for seed in (100, 101)]
+        assert line["return [m]"] == pytest.approx(np.mean(gaps))
+        assert line["return [m] low"] <= line["return [m]"] <= line["return [m] high"]
 
     plan = tmp_path / "plan.png"
     cv2.imwrite(str(plan), np.pad(np.full((200, 300), 255, np.uint8), 5))

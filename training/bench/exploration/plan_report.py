@@ -324,7 +324,8 @@ def _in_family(family: str, other: Rows, rows: Rows) -> str:
     text = number(_mean(own.values()), 1, CM)
     if not own.keys() & first.keys() or rows[0]["policy"] == other[0]["policy"]:
         return text
-    return f"{text}, {_e_column('').text(_paired(own, first))}"
+    column = _e_column("")
+    return f"{text}, {column.text(column.scaled(_paired(own, first)))}"
 
 
 def _share_of_error(name: str, rows: Rows) -> float:
