@@ -1,40 +1,21 @@
 """False loop closures in look-alike corridors: does a filter take a corridor for the one that looks the same?
 
-    python -m studies.false_closures --trials 1000 --json false_closures.json
-
-In each trial a robot with the default noise, camera and filter of environments drives along corridor A, by a way round
-into corridor B, which has the same landmarks with the same descriptors at the same places, along it, and back into A.
-Corridors are 6 to 10 m long, 3 m wide, and their centre lines 4 to 7 m apart. Three kinds of trials alternate:
-
-- `seen`: B is A shifted; there are landmarks, which look different, on the way round.
-- `blind`: B is A shifted; nothing is seen on the way round, so that the pose is uncertain at the entrance to B.
-- `turned`: B is A turned by half a turn and driven in the opposite direction: the robot sees in B what it saw in A.
-
-A match is wrong if the landmark was created by a measurement of another true landmark. A *false loop closure* is three
-wrong matches within ten ticks. A true one, which shows that closing is possible at all, is three right matches in a
-tick with landmarks of A, on the way back, that were not seen for 100 ticks.
+python -m studies.false_closures --trials 1000
 """
 
-import os
-
-os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
-import typer
-from rich.console import Console
 
-from slam_backend.core.files import check_writable, write_file
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between, wrap_angle
-from training.experiments.tables import console_table
+from training.commands.study import run_program
+from training.experiments.config import ExperimentConfig, first_seed, option
+from training.experiments.study import Column, ResultTable, Study
 from vslam_env.belief.belief import default_filter_options
 from vslam_env.sensors.landmark_sensor import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.world import LandmarkConfig, Landmarks, OdometryNoise, World
@@ -42,7 +23,7 @@ from vslam_env.world.landmarks import draw_descriptors
 from vslam_env.world.odometry import draw_bias, read_odometry
 
 Kind = Literal["seen", "blind", "turned"]
-KINDS: tuple[Kind, ...] = ("seen", "blind", "turned")
+KINDS: tuple[Kind, ...] = get_args(Kind)
 WIDTH = 3.0  # of corridors [m]
 LENGTHS, PITCHES = (6.0, 10.0), (4.0, 7.0)  # ranges of the length of corridors, and of their distance [m]
 # Short walls across a corridor: length [m], range of the distance to the next one [m], landmarks per metre of face.
@@ -54,25 +35,25 @@ LONG_UNSEEN = 100  # ticks after which a landmark that is matched again closes a
 FAR = 4.0  # standard deviations of the offset to the copy within which a trial counts as ambiguous
 
 
+class Config(ExperimentConfig):
+    """Drives through look-alike corridors."""
+
+    trials: int = option(1000, "Number of drives.", ge=1, hint="Use at least one drive.")
+    seed: int = first_seed()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """Outcome of one trial."""
+    """One drive."""
 
-    seed: int
-    kind: str  # One of `KINDS`
-    pitch_m: float  # Distance from A to B
-    sigma_m: float  # Claimed standard deviation across the corridors on entering B
-    error_m: float  # True error across the corridors there
-    matches: int  # Matches with landmarks
-    wrong: int  # Matches with a landmark that another true landmark created
-    false_closures: int  # Ticks at which a false loop closure begins
-    true_closure: bool  # Whether the loop was closed on the way back through A
-    end_error_m: float  # Position error at the end
+    kind: Kind  # Kind of the corridors
+    seed: int  # Seed of corridors and noise
 
-    @property
-    def offset_sigmas(self) -> float:
-        """Offset to the copy in claimed standard deviations on entering B."""
-        return self.pitch_m / self.sigma_m
+
+def trials(config: Config) -> list[Trial]:
+    """Return all trials; kinds alternate."""
+    seeds = range(config.seed, config.seed + config.trials)
+    return [Trial(kind=KINDS[seed % len(KINDS)], seed=seed) for seed in seeds]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,15 +143,28 @@ def build_corridors(kind: Kind, length: float, pitch: float, rng: np.random.Gene
     )  # fmt: skip
 
 
-def run_trial(seed: int, **changes: Any) -> Trial:
-    """Drive through corridors of a seed; `changes` replace options of the filter."""
-    kind = KINDS[seed % len(KINDS)]
-    rng = np.random.default_rng(seed)
+def play(config: Config, trial: Trial, **changes: Any) -> dict[str, Any]:
+    """Drive through corridors, with the default noise, camera and filter of environments.
+
+    A match is wrong if the landmark was created by a measurement of another true landmark. A false loop closure is
+    three wrong matches within ten ticks; a true one, which shows that closing is possible at all, is three right
+    matches, on the way back, with landmarks of A that were not seen for 100 ticks.
+
+    Args:
+        changes: Options of the filter that differ.
+
+    Returns:
+        On entering B the claimed standard deviation `sigma_m` and the true error `error_m` across the corridors, and
+        whether `pitch_m`, the distance of A and B, is beyond four of the former: `offset`. Numbers of
+        `matches`, `wrong` ones and `false_closures`; whether there is a `true_closure`; the position error at the end
+        `end_error_m`.
+    """
+    rng = np.random.default_rng(trial.seed)
     length, pitch = rng.uniform(*LENGTHS), rng.uniform(*PITCHES)
-    built = build_corridors(kind, length, pitch, rng)
+    built = build_corridors(trial.kind, length, pitch, rng)
     noise, sensor = OdometryNoise(), LandmarkSensor(LandmarkSensorConfig(), built.world.walls, built.landmarks)
     bias = draw_bias(noise, 1, rng)
-    slam = FastSlam.from_options(1, replace(default_filter_options(), **changes), seed)
+    slam = FastSlam.from_options(1, replace(default_filter_options(), **changes), trial.seed)
     claims: dict[int, int] = {}
     matched_at: dict[int, int] = {}  # last tick at which each true landmark was created or rightly matched
     wrong_at: list[int] = []  # wrong matches by tick
@@ -199,44 +193,45 @@ def run_trial(seed: int, **changes: Any) -> Trial:
     recent = np.convolve(wrong_at, np.ones(WITHIN))[: len(wrong_at)] >= CLOSING
     begins = np.diff(recent.astype(int), prepend=0) > 0
     off = slam.pose().mean - between(built.path[0], built.path[-1])
-    return Trial(
-        seed=seed, kind=kind, pitch_m=pitch, sigma_m=sigma, error_m=error, matches=matched, wrong=sum(wrong_at),
-        false_closures=int(begins.sum()), true_closure=known_again >= CLOSING, end_error_m=float(np.hypot(*off[:2])),
-    )  # fmt: skip
+    return {
+        "offset": f"<= {FAR:g}" if pitch <= FAR * sigma else f"> {FAR:g}", "pitch_m": pitch, "sigma_m": sigma,
+        "error_m": error, "matches": matched, "wrong": sum(wrong_at), "false_closures": int(begins.sum()),
+        "true_closure": known_again >= CLOSING, "end_error_m": float(np.hypot(*off[:2])),
+    }  # fmt: skip
 
 
-def rows_of(trials: Sequence[Trial]) -> list[list[str]]:
-    """Return one row of the table per kind and range of the offset in standard deviations."""
-    rows = []
-    for kind in KINDS:
-        for near, title in ((True, f"up to {FAR:g}"), (False, f"beyond {FAR:g}")):
-            own = [trial for trial in trials if trial.kind == kind and (trial.offset_sigmas <= FAR) == near]
-            if own:
-                rows.append([
-                    kind, title, str(len(own)), str(sum(trial.false_closures > 0 for trial in own)),
-                    f"{sum(trial.wrong for trial in own)} of {sum(trial.matches for trial in own)}",
-                    str(sum(trial.true_closure for trial in own)),
-                    f"{np.median([trial.sigma_m for trial in own]):.2f}",
-                    f"{np.median([trial.end_error_m for trial in own]):.2f}",
-                ])  # fmt: skip
-    return rows
+STUDY = Study(
+    name="false_closures",
+    about="""Count false loop closures in look-alike corridors.
 
-
-def main(
-    trials: Annotated[int, typer.Option(help="Number of trials.", min=1)] = 1000,
-    seed: Annotated[int, typer.Option(help="First seed.", min=0)] = 0,
-    to: Annotated[Path | None, typer.Option("--json", help="File for the outcomes.")] = None,
-) -> None:
-    """Count false loop closures in look-alike corridors."""
-    if to is not None:
-        check_writable(to, "--json")
-    outcomes = [run_trial(each) for each in range(seed, seed + trials)]
-    headings = ["kind", "offset [sigma]", "trials", "with a false closure", "wrong matches", "closed on the way back",
-                "sigma [m]", "end error [m]"]  # fmt: skip
-    Console().print(console_table("False loop closures in look-alike corridors", headings, rows_of(outcomes)))
-    if to is not None:
-        write_file(to, json.dumps([asdict(trial) for trial in outcomes], indent=1))
-
+    A robot drives along corridor A, by a way round into corridor B, which has the same landmarks with the same
+    descriptors at the same places, along it, and back into A. Corridors are 6 to 10 m long, 3 m wide, and their centre
+    lines 4 to 7 m apart. Kinds: seen, B is A shifted, and there are landmarks, which look different, on the way round;
+    blind, nothing is seen on the way round, so that the pose is uncertain at the entrance to B; turned, B is A turned
+    by half a turn and driven in the opposite direction: the robot sees in B what it saw in A. Columns: trials with a
+    false closure, wrong matches among all, trials whose loop is closed on the way back.
+    """,
+    config=Config,
+    trial=Trial,
+    trials=trials,
+    play=play,
+    quick={"trials": 6},
+    tables=(
+        ResultTable(
+            name="closures", title="False loop closures in look-alike corridors", by=("kind", "offset"),
+            pooled=("offset",), words={"offset": ("offset [sigma]", str)},
+            columns=(
+                Column("trials", statistic=len, digits=0),
+                Column("false_closures", "false", lambda rows: sum(r["false_closures"] > 0 for r in rows),
+                       digits=0),
+                Column("wrong", "wrong matches", "sum", digits=0), Column("matches", statistic="sum", digits=0),
+                Column("true_closure", "closed", "sum", digits=0),
+                Column("sigma_m", "sigma [m]", "median", digits=2),
+                Column("end_error_m", "end error [m]", "median", digits=2),
+            ),
+        ),
+    ),
+)  # fmt: skip
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_program(STUDY)

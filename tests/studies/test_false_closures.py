@@ -1,5 +1,7 @@
 """Look-alike corridors close no loop falsely, and the script would count it if they did."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
@@ -30,19 +32,21 @@ def test_both_corridors_look_the_same(kind: str) -> None:
 
 def test_a_filter_without_a_position_gate_closes_loops_falsely() -> None:
     """A gate that lets pass what is metres off takes B for A, and the trial says so."""
-    trial = closures.run_trial(0, position_gate=1e9, new_landmark_gate=1e9, ambiguity_margin=0.0)
-    assert trial.false_closures > 0
-    assert trial.wrong > 20
+    trial = closures.Trial(kind="seen", seed=0)
+    row = closures.play(closures.Config(), trial, position_gate=1e9, new_landmark_gate=1e9, ambiguity_margin=0.0)
+    assert row["false_closures"] > 0
+    assert row["wrong"] > 20
 
 
 @pytest.mark.slow
 def test_look_alike_corridors_close_no_loop_falsely() -> None:
     """No trial of any kind has a false loop closure; the way back through A is recognised in most."""
-    trials = [closures.run_trial(seed) for seed in range(5000, 5030)]
-    assert {trial.kind for trial in trials} == set(closures.KINDS)
-    assert [trial.seed for trial in trials if trial.false_closures] == []
-    assert sum(trial.true_closure for trial in trials) >= 20
-    assert sum(trial.end_error_m < 1.0 for trial in trials) >= 27
-    assert min(trial.matches for trial in trials) > 50
-    rows = closures.rows_of(trials)
-    assert sum(int(row[2]) for row in rows) == 30
+    config = closures.Config(trials=30, seed=5000)
+    rows = [asdict(trial) | closures.play(config, trial) for trial in closures.trials(config)]
+    assert {row["kind"] for row in rows} == set(closures.KINDS)
+    assert [row["seed"] for row in rows if row["false_closures"]] == []
+    assert sum(row["true_closure"] for row in rows) >= 20
+    assert sum(row["end_error_m"] < 1.0 for row in rows) >= 27
+    assert min(row["matches"] for row in rows) > 50
+    lines = [line for line in closures.STUDY.tables[0].lines(rows) if line["offset"] == "all"]
+    assert [line["trials"].value for line in lines] == [10, 10, 10]

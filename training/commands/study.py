@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -18,6 +19,7 @@ if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that
     from training.experiments.study import Claim, ResultTable, Row, Study
 
 TRIALS_FILE = "trials.jsonl"
+HEADING = 12  # least width to which headings are folded [letters]
 
 
 def command_of(study: "Study[Any, Any]", command: str) -> Callable[..., None]:
@@ -114,10 +116,15 @@ def print_table(console: Console, table: "ResultTable", lines: Sequence[dict[str
     from training.experiments.tables import console_table
 
     for title, rows in table.parts(lines):
-        headings = [heading.replace(" [", "\n[") for heading in table.headings]
         cells = [[re.sub(r" \((\S+) \.\. (\S+)\)$", r"\n\1..\2", text) for text in row] for row in rows]
+        columns = list(zip(*cells, strict=True))
+        widths = [max([HEADING, *(len(line) for text in texts for line in text.splitlines())]) for texts in columns]
+        headings = [
+            "\n".join(fill(line, width, break_long_words=False) for line in heading.split("\n"))
+            for heading, width in zip((h.replace(" [", "\n[") for h in table.headings), widths, strict=True)
+        ]
         shown = console_table(title, headings, cells)
-        for column, texts in zip(shown.columns[1:], list(zip(*cells, strict=True))[1:], strict=True):
+        for column, texts in zip(shown.columns[1:], columns[1:], strict=True):
             column.no_wrap = not any(" " in text for text in texts)
         console.print(shown)
     if table.note:
