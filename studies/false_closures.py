@@ -154,10 +154,9 @@ def play(config: Config, trial: Trial, **changes: Any) -> dict[str, Any]:
         changes: Options of the filter that differ.
 
     Returns:
-        On entering B the claimed standard deviation `sigma_m` and the true error `error_m` across the corridors, and
-        whether `pitch_m`, the distance of A and B, is beyond four of the former: `offset`. Numbers of
-        `matches`, `wrong` ones and `false_closures`; whether there is a `true_closure`; the position error at the end
-        `end_error_m`.
+        `sigma_m` and `error_m`: claimed standard deviation and true error across the corridors on entering B; `offset`:
+        whether `pitch_m`, the distance of A and B, is beyond four of the former; numbers of `matches`, of `wrong` ones
+        and of `false_closures`; whether there is a `true_closure`; `end_error_m`: position error at the end.
     """
     rng = np.random.default_rng(trial.seed)
     length, pitch = rng.uniform(*LENGTHS), rng.uniform(*PITCHES)
