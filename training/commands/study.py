@@ -19,7 +19,6 @@ if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that
     from training.experiments.study import Claim, ResultTable, Row, Study
 
 TRIALS_FILE = "trials.jsonl"
-HEADING = 12  # least width to which headings are folded [letters]
 
 
 def command_of(study: "Study[Any, Any]", command: str) -> Callable[..., None]:
@@ -112,20 +111,28 @@ def write_tables(
 
 
 def print_table(console: Console, table: "ResultTable", lines: Sequence[dict[str, Any]]) -> None:
-    """Print a table for a narrow console: units and intervals are on a second line, and only texts are folded."""
+    """Print a table for a narrow console.
+
+    Units and intervals are on a second line, headings are folded to the width of their column, and numbers are folded
+    only if there is no room for them all.
+    """
     from training.experiments.tables import console_table
 
     for title, rows in table.parts(lines):
         cells = [[re.sub(r" \((\S+) \.\. (\S+)\)$", r"\n\1..\2", text) for text in row] for row in rows]
         columns = list(zip(*cells, strict=True))
-        widths = [max([HEADING, *(len(line) for text in texts for line in text.splitlines())]) for texts in columns]
+        words = [
+            [len(word) for text in (heading, *texts) for word in text.split()]
+            for heading, texts in zip(table.headings, columns, strict=True)
+        ]
+        widths = [max([1, *lengths]) for lengths in words]
         headings = [
-            "\n".join(fill(line, width, break_long_words=False) for line in heading.split("\n"))
-            for heading, width in zip((h.replace(" [", "\n[") for h in table.headings), widths, strict=True)
+            "\n".join(fill(line, width) for line in heading.replace(" [", "\n[").split("\n"))
+            for heading, width in zip(table.headings, widths, strict=True)
         ]
         shown = console_table(title, headings, cells)
         for column, texts in zip(shown.columns[1:], columns[1:], strict=True):
-            column.no_wrap = not any(" " in text for text in texts)
+            column.no_wrap = sum(widths) + 2 * len(widths) + 1 < console.width and not any(" " in t for t in texts)
         console.print(shown)
     if table.note:
         console.print(table.note)

@@ -1,1 +1,0 @@
-"""Merges of maps in soak runs: outcomes, and tables of kept runs."""
