@@ -1,19 +1,14 @@
-"""Simulated logs of robots among barriers, and results of filters with and without rejuvenation.
+"""Maps of filters with and without rejuvenation, on simulated logs of robots among barriers.
 
-    python -m studies.barrier_logs              # one robot
-    python -m studies.barrier_logs --team 3     # three robots that merge
-
-Robots drive at up to 0.3 m/s and 30 degrees/s in a hall of 15 x 8 m with 15 landmarks of known identity. Walls block
-the line of sight; one or two measurements per second are read. Noise of odometry and measurements is like that of
-MR.CLAM, and filters make the assumptions of the replay of MR.CLAM.
+python -m studies.barrier_logs --seeds 12
 """
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from itertools import product
+from typing import Any, Literal
 
 import numpy as np
-import typer
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.filter import FastSlam
@@ -25,9 +20,27 @@ from slam_backend.readers.conversions import points_from_polar
 from slam_backend.readers.mrclam import SightingNoise
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.team import TeamSlam
+from training.commands.study import run_program
+from training.experiments.config import ExperimentConfig, RobotCount, first_seed, option
+from training.experiments.study import Column, ResultTable, Study
 from training.replay.core import PARTICLES_PER_ROBOT
 from training.replay.readers import GATES, MAX_SIGMA_HEADING, MOTION, POSITION_FLOOR
 
+Condition = Literal["assumed", "odometry", "wide", "open", "often", "slow"]
+CONDITIONS: dict[Condition, dict[str, Any]] = {
+    "assumed": {},
+    "odometry": {"odometry_scale": 2.0},  # noise twice the assumed one
+    "wide": {"view": math.radians(90.0)},  # field of view of 180 degrees
+    "open": {"num_walls": 0},
+    "often": {"rate": 4.0},  # measurements per second
+    "slow": {"speed": 0.1, "turn": math.radians(10.0)},
+}
+FILTERS: dict[str, dict[str, Any]] = {
+    "100 particles": {"rejuvenate_every": None},
+    "1,000 particles": {"num_particles": 1000, "rejuvenate_every": None},
+    "rejuvenated": {"rejuvenate_every": 100},
+}
+TEAM_FILTERS = ("100 particles", "rejuvenated")  # with `PARTICLES_PER_ROBOT` for each robot
 DT = 0.25  # [s]
 HALL = np.array([15.0, 8.0])  # [m]
 NUM_LANDMARKS = 15
@@ -174,25 +187,85 @@ def simulate(
     return logs
 
 
-def live(log: BarrierLog, seed: int, **options: Any) -> dict[str, float]:
-    """Run a filter on a log.
+class Config(ExperimentConfig):
+    """Logs of robots in halls with walls."""
+
+    conditions: tuple[Condition, ...] = option(
+        tuple(CONDITIONS), "Conditions: assumed, odometry (twice the noise), wide (180 degrees), open (no walls), "
+        "often (4 measurements a second), slow (0.1 m/s).",
+    )  # fmt: skip
+    robots: tuple[RobotCount, ...] = option((1,), "Numbers of robots in a hall; several merge.")
+    duration: float = option(900.0, "Length of the logs [s].", gt=0.0, hint="Give seconds.")
+    seeds: int = option(12, "Number of halls.", ge=1, hint="Use at least one hall.")
+    seed: int = first_seed()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One filter, or one team, on the logs of a hall."""
+
+    condition: Condition
+    robots: int
+    filter: str  # Name in `FILTERS`
+    seed: int  # Seed of the hall, all noise and the filter
+
+
+def trials(config: Config) -> list[Trial]:
+    """Return all trials."""
+    return [
+        Trial(condition=condition, robots=robots, filter=name, seed=seed)
+        for condition, robots in product(config.conditions, config.robots)
+        for name in (FILTERS if robots == 1 else TEAM_FILTERS)
+        for seed in range(config.seed, config.seed + config.seeds)
+    ]
+
+
+def play(config: Config, trial: Trial) -> dict[str, Any]:
+    """Run a filter, or a team, on the logs of a hall.
 
     Returns:
-        Map error after the best fit [m], spread of landmarks over the particles [m], mean NIS, and whether the filter
-        raised a warning.
+        Number of `groups` at the end; means over their filters of the map error after the best fit `map_rmse_m`, the
+        spread of landmarks over the particles `spread_m`, and the mean NIS `nis`; whether one `warned`.
     """
-    slam = FastSlam(motion=MOTION, seed=seed, **(GATES["given"] | options))
+    logs = simulate(trial.seed, trial.robots, config.duration, **CONDITIONS[trial.condition])
+    filters = run_team(logs, trial) if trial.robots > 1 else [run_alone(logs[0], trial)]
+    consistencies = [slam.consistency for slam in filters]
+    return {
+        "groups": len(filters), "map_rmse_m": float(np.mean([map_error(logs[0], slam) for slam in filters])),
+        "spread_m": float(np.mean([spread(slam) for slam in filters])),
+        "nis": float(np.mean([consistency.nis_mean for consistency in consistencies])),
+        "warned": any(consistency.warnings for consistency in consistencies),
+    }  # fmt: skip
+
+
+def run_alone(log: BarrierLog, trial: Trial) -> FastSlam:
+    """Return a filter after a log."""
+    slam = FastSlam(motion=MOTION, seed=trial.seed, **(GATES["given"] | FILTERS[trial.filter]))
     for step, (move, frame, names) in enumerate(zip(log.odometry, log.frames, log.identities, strict=True)):
         slam.step([move if step else None], [frame], [names])
-    consistency = slam.consistency
+    return slam
+
+
+def run_team(logs: list[BarrierLog], trial: Trial) -> list[FastSlam]:
+    """Return the filters of a team's groups after the logs of its robots."""
+    team = TeamSlam(
+        len(logs), seed=trial.seed, num_particles=PARTICLES_PER_ROBOT * len(logs), motion=MOTION,
+        alignment=AlignmentOptions(
+            position_floor=POSITION_FLOOR, min_inliers=NUM_LANDMARKS - MISSING, max_sigma_heading=MAX_SIGMA_HEADING
+        ),
+        attempts=AttemptOptions(new_candidates=1), **(FILTERS[trial.filter] | GATES["given"]),
+    )  # fmt: skip
+    for step in range(len(logs[0].truth)):
+        moves = [log.odometry[step] if step else None for log in logs]
+        team.step(moves, [log.frames[step] for log in logs], identities=[log.identities[step] for log in logs])
+    return [group.trunk.filter for group in team._groups]
+
+
+def spread(slam: FastSlam) -> float:
+    """Return the spread of the landmarks over the particles [m]."""
     maps = slam.maps
     means = maps.dense(maps.used_slots())[0][:, :3]
-    return {
-        "map": map_error(log, slam),
-        "spread": float(np.sqrt(means[:, :2].var(axis=2).sum(axis=1).mean())),
-        "nis": consistency.nis_mean,
-        "warned": float(bool(consistency.warnings)),
-    }
+    return float(np.sqrt(means[:, :2].var(axis=2).sum(axis=1).mean()))
 
 
 def map_error(log: BarrierLog, slam: FastSlam) -> float:
@@ -205,71 +278,31 @@ def map_error(log: BarrierLog, slam: FastSlam) -> float:
     return float(np.sqrt(((moved.means[:, :2] - true) ** 2).sum(axis=1).mean()))
 
 
-def live_as_team(logs: list[BarrierLog], seed: int, rejuvenate_every: int | None) -> tuple[int, list[int], float]:
-    """Run a team on the logs of its robots; return number of groups, sizes of their maps, and the mean error."""
-    team = TeamSlam(
-        len(logs),
-        alignment=AlignmentOptions(
-            position_floor=POSITION_FLOOR,
-            min_inliers=NUM_LANDMARKS - MISSING,
-            max_sigma_heading=MAX_SIGMA_HEADING,
+STUDY = Study(
+    name="barrier_logs",
+    about="""Map halls with walls by filters with and without rejuvenation.
+
+    Robots drive at up to 0.3 m/s and 30 degrees/s in a hall of 15 x 8 m with 15 landmarks of known identity. Walls
+    block the line of sight; one or two measurements per second are read. Noise of odometry and measurements is like
+    that of MR.CLAM, and filters make the assumptions of the replay of MR.CLAM.
+    """,
+    config=Config,
+    trial=Trial,
+    trials=trials,
+    play=play,
+    quick={"seeds": 2, "duration": 100.0},
+    tables=(
+        ResultTable(
+            name="maps", title="Maps of halls with walls", by=("condition", "robots", "filter"),
+            each=("condition", "robots"), words={"robots": ("robots", lambda robots: f"K = {robots}")},
+            columns=(
+                Column("map_rmse_m", "map [m]", interval=True), Column("map_rmse_m", "least [m]", "least"),
+                Column("map_rmse_m", "most [m]", "worst"), Column("spread_m"), Column("nis", "NIS", digits=2),
+                Column("warned", "warned [%]", digits=0, factor=100.0), Column("groups", digits=1),
+            ),
         ),
-        attempts=AttemptOptions(new_candidates=1),
-        seed=seed,
-        num_particles=PARTICLES_PER_ROBOT * len(logs),
-        motion=MOTION,
-        rejuvenate_every=rejuvenate_every,
-        **GATES["given"],
-    )
-    for step in range(len(logs[0].truth)):
-        moves = [log.odometry[step] if step else None for log in logs]
-        team.step(moves, [log.frames[step] for log in logs], identities=[log.identities[step] for log in logs])
-    filters = [group.trunk.filter for group in team._groups]
-    return len(filters), [slam.map_size for slam in filters], float(np.mean([map_error(logs[0], s) for s in filters]))
-
-
-CONDITIONS: dict[str, dict[str, Any]] = {
-    "as assumed": {},
-    "odometry noise twice the assumed one": {"odometry_scale": 2.0},
-    "field of view of 180 degrees": {"view": math.radians(90.0)},
-    "no walls": {"num_walls": 0},
-    "4 measurements per second": {"rate": 4.0},
-    "0.1 m/s, 10 degrees/s": {"speed": 0.1, "turn": math.radians(10.0)},
-}
-FILTERS: dict[str, dict[str, Any]] = {
-    "100 particles": {"rejuvenate_every": None},
-    "1,000 particles": {"num_particles": 1000, "rejuvenate_every": None},
-    "rejuvenated": {"rejuvenate_every": 100},
-}
-
-
-def main(
-    seeds: Annotated[int, typer.Option(help="Halls.")] = 12,
-    team: Annotated[int, typer.Option(help="Number of robots in a team; 0: a single robot.")] = 0,
-    odometry_scale: Annotated[
-        float, typer.Option(help="Odometry noise of a team, relative to the assumed noise.")
-    ] = 1.0,
-) -> None:
-    """Print map errors under several conditions, as mean (min-max), and the share of filters with a warning."""
-    if team:
-        for seed in range(seeds):
-            logs = simulate(seed, robots=team, odometry_scale=odometry_scale)
-            for every in (None, 100):
-                groups, sizes, error = live_as_team(logs, seed, every)
-                print(f"hall {seed}, every {every}: {groups} groups, landmarks {sizes}, map error {error:.2f} m")
-        return
-    for condition, changes in CONDITIONS.items():
-        logs = [simulate(seed, **changes)[0] for seed in range(seeds)]
-        for name, options in FILTERS.items():
-            rows = [live(log, seed, **options) for seed, log in enumerate(logs)]
-            off = np.array([row["map"] for row in rows])
-            mean = {key: np.mean([row[key] for row in rows]) for key in ("spread", "nis", "warned")}
-            print(
-                f"{condition:34} {name:16} map {off.mean():.3f} ({off.min():.3f}-{off.max():.3f}) m, "
-                f"spread {mean['spread']:.3f} m, NIS {mean['nis']:.2f}, warned {mean['warned']:.0%}",
-                flush=True,
-            )
-
+    ),
+)  # fmt: skip
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_program(STUDY)

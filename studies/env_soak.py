@@ -1,33 +1,25 @@
 """Soak test of environments with random configurations; invariants are checked at every step.
 
-    python -m studies.env_soak --steps 200000 --keep soak.state
-
-The same command resumes from the last snapshot after a kill. Checked at each step: no robot is inside a wall or another
-robot; observations are in their spaces; rewards, infos and `state()` are finite; shares are in [0, 1]. At intervals,
-the beginning of an episode is repeated in a new environment, with another environment stepping in between, and in
-another process with another hash seed: all must return the same bytes. Memory use is recorded. The chained hash of all
-returned values is printed; it is the same for a run that was killed and resumed.
+python -m studies.env_soak --episodes 700
 """
 
-import os
-
-os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-
 import hashlib
+import os
 import subprocess
 import sys
-import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
-from slam_backend.core.validation import check_int
-from vslam_env import EnvConfig, ExplorationEnv, load_state, preset_config, save_state, vslam_v1
+from training.commands.study import run_program
+from training.experiments.config import ExperimentConfig, first_seed, option
+from training.experiments.study import Column, ResultTable, Row, Study
+from vslam_env import EnvConfig, ExplorationEnv, preset_config, vslam_v1
 from vslam_env.belief.observation_keys import SETS
 from vslam_env.world import WORLD_FAMILIES
 from vslam_env.world.clearance import distances_to_walls
@@ -35,7 +27,59 @@ from vslam_env.world.clearance import distances_to_walls
 SKIN = 0.005  # allowed penetration of a robot into walls and robots [m]
 AGAIN_STEPS = 40  # number of repeated steps of an episode
 EVERY = 8  # interval of repeated episodes
-ANSWER = "digest "
+
+
+class Config(ExperimentConfig):
+    """Episodes with random configurations and actions."""
+
+    episodes: int = option(700, "Number of episodes.", ge=1, hint="Use at least one episode.")
+    seed: int = first_seed()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One episode."""
+
+    seed: int  # Seed of the configuration, the episode and the actions
+
+
+def trials(config: Config) -> list[Trial]:
+    """Return all trials."""
+    return [Trial(seed=seed) for seed in range(config.seed, config.seed + config.episodes)]
+
+
+def play(config: Config, trial: Trial) -> dict[str, Any]:
+    """Run an episode of random actions, and check what each step returns.
+
+    The beginning of each eighth episode is repeated beside another environment, from a state, and in another process
+    with another hash seed: all must return the same bytes.
+
+    Returns:
+        `action_type`; number of `steps`; whether it was `repeated`; `digest` of all that was returned; `memory_mb`.
+
+    Raises:
+        AssertionError: If an invariant is violated.
+    """
+    seed, repeated = trial.seed, trial.seed % EVERY == 0
+    if repeated:
+        reference = beginning(seed)
+        assert beginning(seed, beside=True) == reference, f"episode {seed} differs beside another environment"
+        assert beginning(seed, restored_at=AGAIN_STEPS // 2) == reference, f"episode {seed} differs from a state"
+        assert in_another_process(seed, 1 + seed) == reference, f"episode {seed} differs in another process"
+    rng, total, steps = np.random.default_rng(seed), hashlib.sha256(), 0
+    env = vslam_v1.parallel_env(config=random_config(rng))
+    returned: tuple[Any, ...] = env.reset(seed=seed)
+    check(env, returned)
+    digest(returned, total)
+    while env.agents:
+        returned = env.step(random_actions(env, rng))
+        check(env, returned)
+        digest(returned, total)
+        steps += 1
+    return {
+        "action_type": env.config.action_type, "steps": steps, "repeated": repeated, "digest": total.hexdigest(),
+        "memory_mb": memory_mb(),
+    }  # fmt: skip
 
 
 def random_config(rng: np.random.Generator) -> EnvConfig:
@@ -102,8 +146,15 @@ def check(env: ExplorationEnv, returned: tuple[Any, ...]) -> None:
     assert min(gaps, default=np.inf) >= 2.0 * radius - 2.0 * SKIN, "two robots overlap"
 
 
-def beginning(seed: int, steps: int, beside: bool) -> str:
-    """Return the hash of the first steps of an episode in a new environment, optionally with another in between."""
+def beginning(
+    seed: int, steps: int = AGAIN_STEPS, beside: bool = False, restored_at: int | None = None
+) -> str:  # fmt: skip
+    """Return the hash of the first steps of an episode in a new environment.
+
+    Args:
+        beside: Whether another environment steps in between.
+        restored_at: Step after which an environment made from the state goes on; None: none.
+    """
     rng = np.random.default_rng(seed)
     env = vslam_v1.parallel_env(config=random_config(rng))
     other, other_rng = vslam_v1.parallel_env(world="fig5", num_robots=2, num_particles=5), np.random.default_rng(1)
@@ -111,25 +162,27 @@ def beginning(seed: int, steps: int, beside: bool) -> str:
         other.reset(seed=seed + 1)
     total = hashlib.sha256()
     digest(env.reset(seed=seed), total)
-    for _ in range(steps):
+    for step in range(steps):
         if not env.agents:
             break
+        if step == restored_at:
+            state, env = env.get_state(), vslam_v1.parallel_env(config=env.config)
+            env.set_state(state)
         digest(env.step(random_actions(env, rng)), total)
         if beside and other.agents:
             other.step(random_actions(other, other_rng))
     return total.hexdigest()
 
 
-def in_another_process(seed: int, steps: int, hash_seed: int) -> str:
+def in_another_process(seed: int, hash_seed: int, steps: int = AGAIN_STEPS) -> str:
     """Return the result of `beginning` in another process with another hash seed."""
+    program = f"from studies import env_soak; print(env_soak.beginning({seed}, {steps}))"
+    root, own = str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")
+    changed = {"PYTHONHASHSEED": str(hash_seed), "PYTHONPATH": os.pathsep.join(filter(None, (root, own)))}
     done = subprocess.run(
-        [sys.executable, __file__, "--beginning", str(seed), "--steps", str(steps)],
-        env=os.environ | {"PYTHONHASHSEED": str(hash_seed)},
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", program], env=os.environ | changed, capture_output=True, text=True, check=True
     )
-    return next(line for line in done.stdout.splitlines() if line.startswith(ANSWER)).removeprefix(ANSWER)
+    return done.stdout.split()[-1]
 
 
 def memory_mb() -> float:
@@ -141,98 +194,39 @@ def memory_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-@dataclass(slots=True)
-class Soak:
-    """Progress of a soak test: its complete state, except for the environment."""
-
-    seed: int
-    steps: int = 0
-    episodes: int = 0
-    chain: str = ""
-    again: int = 0
-    rng_state: Any = None
-
-    def run(self, until: int, keep: Path | None, keep_every: int = 2000, log: Any = lambda text: None) -> None:
-        """Step until the given number of steps, with regular snapshots if a file is given."""
-        env, rng = self._restored(keep) if self.rng_state is not None else self._begun()
-        begin, first, memory = time.perf_counter(), self.steps, float("nan")
-        while self.steps < until:
-            if not env.agents:
-                env, rng = self._begun()
-            returned = env.step(random_actions(env, rng))
-            self.steps += 1
-            self._take(env, returned)
-            if self.steps - first == max((until - first) // 4, 1):
-                memory = memory_mb()  # after a quarter kernels are loaded and caches are full
-            if keep is not None and (self.steps % keep_every == 0 or self.steps == until):
-                self.rng_state = rng.bit_generator.state
-                save_state(env.get_state() | {"soak": self._numbers()}, keep)
-                rate = (self.steps - first) / (time.perf_counter() - begin)
-                log(f"{self.steps} steps, {self.episodes} episodes, {rate:.0f} per second, {memory_mb():.0f} MB")
-        log(f"memory: {memory:.0f} MB after a quarter, {memory_mb():.0f} MB at the end")
-
-    @classmethod
-    def resumed(cls, keep: Path) -> "Soak":
-        """Return the soak test from the snapshot in a file."""
-        return cls(**load_state(keep)["soak"])
-
-    def _numbers(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__slots__}
-
-    def _restored(self, keep: Path | None) -> tuple[ExplorationEnv, np.random.Generator]:
-        assert keep is not None
-        state, rng = load_state(keep), np.random.default_rng()
-        rng.bit_generator.state = self.rng_state
-        env = vslam_v1.parallel_env(config=state["config"])
-        env.set_state(state)
-        return env, rng
-
-    def _begun(self) -> tuple[ExplorationEnv, np.random.Generator]:
-        """Start the next episode; every eighth is also repeated beside another environment and in another process."""
-        seed = 1000 * self.seed + self.episodes
-        if self.episodes % EVERY == 0:
-            reference = beginning(seed, AGAIN_STEPS, False)
-            assert beginning(seed, AGAIN_STEPS, True) == reference, (
-                f"episode {seed} differs with another environment in between"
-            )
-            assert in_another_process(seed, AGAIN_STEPS, 1 + seed) == reference, (
-                f"episode {seed} differs in another process"
-            )
-            self.again += 1
-        rng = np.random.default_rng(seed)
-        env = vslam_v1.parallel_env(config=random_config(rng))
-        self._take(env, env.reset(seed=seed))
-        self.episodes += 1
-        return env, rng
-
-    def _take(self, env: ExplorationEnv, returned: tuple[Any, ...]) -> None:
-        check(env, returned)
-        total = hashlib.sha256(self.chain.encode())
-        digest(returned, total)
-        self.chain = total.hexdigest()
+def _memory(place: int, rows: Sequence[Row]) -> float | None:
+    """Return the memory after an episode, in the order of the rows [MB]."""
+    found: float | None = rows[place]["memory_mb"]
+    return found
 
 
-def main(
-    steps: Annotated[int, typer.Option(help="Total number of environment steps.")] = 200_000,
-    seed: Annotated[int, typer.Option(help="Seed of configurations and actions.")] = 0,
-    keep: Annotated[Path | None, typer.Option(help="File of snapshots; an existing one is resumed.")] = None,
-    beginning_of: Annotated[
-        int | None, typer.Option("--beginning", help="Only print the hash of the first steps of this seed's episode.")
-    ] = None,
-) -> None:
-    """Run the soak test; the first violated invariant ends it with an AssertionError."""
-    check_int("steps", steps, 1, "Use at least one step.")
-    if beginning_of is not None:
-        typer.echo(ANSWER + beginning(check_int("beginning", beginning_of, 0, "Give a seed."), steps, False))
-        return
-    soak = Soak.resumed(keep) if keep is not None and keep.exists() else Soak(seed)
-    if soak.steps:
-        typer.echo(f"Resuming after {soak.steps} steps.")
-    soak.run(steps, keep, log=typer.echo)
-    typer.echo(
-        f"{soak.steps} steps in {soak.episodes} episodes, {soak.again} repeated: all invariants hold. {soak.chain}"
-    )
+STUDY = Study(
+    name="env_soak",
+    about="""Run episodes with random configurations and actions, and check invariants at each step.
 
+    No robot is inside a wall or another robot; observations are in their spaces; rewards, infos and `state()` are
+    finite; shares are in [0, 1]. The beginning of each eighth episode is repeated beside another environment, from a
+    state, and in another process. The first violated invariant ends the test with an AssertionError; the same command
+    with --out FOLDER goes on.
+    """,
+    config=Config,
+    trial=Trial,
+    trials=trials,
+    play=play,
+    quick={"episodes": 8},
+    tables=(
+        ResultTable(
+            name="episodes", title="Episodes in which all invariants hold", by=("action_type",),
+            pooled=("action_type",),
+            columns=(
+                Column("episodes", statistic=len, digits=0), Column("steps", statistic="sum", digits=0),
+                Column("repeated", statistic="sum", digits=0),
+                Column("memory_mb", "memory after the first [MB]", partial(_memory, 0), digits=0),
+                Column("memory_mb", "after the last [MB]", partial(_memory, -1), digits=0),
+            ),
+        ),
+    ),
+)  # fmt: skip
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_program(STUDY)

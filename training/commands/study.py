@@ -113,29 +113,37 @@ def write_tables(
 def print_table(console: Console, table: "ResultTable", lines: Sequence[dict[str, Any]]) -> None:
     """Print a table for a narrow console.
 
-    Units and intervals are on a second line, headings are folded to the width of their column, and numbers are folded
-    only if there is no room for them all.
+    Units and intervals are on a second line. Where there is no room, headings are folded first, then texts, and
+    numbers last.
     """
     from training.experiments.tables import console_table
 
     for title, rows in table.parts(lines):
         cells = [[re.sub(r" \((\S+) \.\. (\S+)\)$", r"\n\1..\2", text) for text in row] for row in rows]
         columns = list(zip(*cells, strict=True))
-        words = [
-            [len(word) for text in (heading, *texts) for word in text.split()]
-            for heading, texts in zip(table.headings, columns, strict=True)
-        ]
-        widths = [max([1, *lengths]) for lengths in words]
-        headings = [
-            "\n".join(fill(line, width) for line in heading.replace(" [", "\n[").split("\n"))
-            for heading, width in zip(table.headings, widths, strict=True)
-        ]
+        headings = [heading.replace(" [", "\n[") for heading in table.headings]
+        if _width(headings, columns) > console.width:
+            headings = [
+                "\n".join(fill(line, _longest(heading, *texts)) for line in heading.split("\n"))
+                for heading, texts in zip(headings, columns, strict=True)
+            ]
         shown = console_table(title, headings, cells)
         for column, texts in zip(shown.columns[1:], columns[1:], strict=True):
-            column.no_wrap = sum(widths) + 2 * len(widths) + 1 < console.width and not any(" " in t for t in texts)
+            column.no_wrap = _width(headings, columns) <= console.width and not any(" " in text for text in texts)
         console.print(shown)
     if table.note:
         console.print(table.note)
+
+
+def _width(headings: Sequence[str], columns: Sequence[Sequence[str]]) -> int:
+    """Return the width of a table whose texts are folded at all spaces, but not its headings."""
+    pairs = zip(headings, columns, strict=True)
+    return 2 + sum(2 + max(_longest(*texts), *map(len, heading.split("\n"))) for heading, texts in pairs)
+
+
+def _longest(*texts: str) -> int:
+    """Return the length of the longest word of some texts."""
+    return max((len(word) for text in texts for word in text.split()), default=1)
 
 
 def _play(play: Callable[[Any, Any], Any], config: Any, trial: Any) -> dict[str, Any]:

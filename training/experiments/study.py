@@ -37,7 +37,7 @@ class Estimate(NamedTuple):
 
 
 STATISTICS: dict[str, Callable[..., Any]] = {
-    "mean": np.mean, "median": np.median, "worst": np.max, "sum": np.sum,
+    "mean": np.mean, "median": np.median, "least": np.min, "worst": np.max, "sum": np.sum,
     "geometric mean": gmean, "p95": lambda values, axis=None: np.quantile(values, 0.95, axis=axis),
     "share above 0": lambda values, axis=None: np.mean(values > 0.0, axis=axis),
 }  # fmt: skip

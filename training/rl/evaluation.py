@@ -71,7 +71,7 @@ STUDY = Study(
             against="policy", base=MODEL,
             columns=(
                 Column("seeds", statistic=len, digits=0), RETURN,
-                Column("return", "higher in [%]", "share above 0", 0, 100.0), MAP_ERROR,
+                Column("return", "higher [%]", "share above 0", 0, 100.0), MAP_ERROR,
             ),
         ),
     ),

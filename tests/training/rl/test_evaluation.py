@@ -28,7 +28,7 @@ def test_policies_are_compared_with_the_model_on_common_seeds() -> None:
     policies, differences = STUDY.tables
     assert [line["policy"] for line in policies.lines(rows)] == ["model", "frontier"]
     (line,) = differences.lines(rows)
-    assert (line["policy"], line["seeds"].value, line["higher in [%]"].value) == ("frontier", 2, 50.0)
+    assert (line["policy"], line["seeds"].value, line["higher [%]"].value) == ("frontier", 2, 50.0)
     np.testing.assert_allclose(line["return [m]"], [0.0, -0.2, 0.2], atol=1e-12)
 
 
@@ -38,7 +38,7 @@ def test_equal_differences_have_an_interval_of_no_width() -> None:
     policies, differences = STUDY.tables
     (line,) = differences.lines(rows)
     np.testing.assert_allclose(line["return [m]"], [-0.25, -0.25, -0.25])
-    assert line["higher in [%]"].value == 0.0
+    assert line["higher [%]"].value == 0.0
     mean, low, high = policies.lines(rows)[0]["return [m]"]
     assert mean == pytest.approx(2.25)
     assert low < 2.25 < high

@@ -1,6 +1,6 @@
 """Time of `env.step` in several checkouts of this repository, measured in alternation.
 
-    python -m studies.in_turn.steps ../before . --config '{"num_robots": 6}'
+    python -m studies.in_turn ../before . --config '{"num_robots": 6}'
 
 Only public names are used, so that trees with different modules can be compared. Each checkout runs the same episode
 with the same actions in its own process, and only one process runs at a time, in bursts of 20 steps. Variations of the

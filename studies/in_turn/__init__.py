@@ -1,1 +1,0 @@
-"""Speed of two checkouts, and of several worlds, in alternation on a busy machine."""
