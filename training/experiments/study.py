@@ -11,7 +11,7 @@
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import gmean
 
 from training.experiments.config import ExperimentConfig
-from training.experiments.statistics import differences, grouped, interval, mean_curves
+from training.experiments.statistics import differences, grouped, interval
 from training.experiments.tables import csv_text, in_words, markdown_table, number
 
 Row = Mapping[str, Any]
@@ -257,8 +257,21 @@ class Curves:
     words: Words = field(default_factory=dict)
 
     def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
-        """Return a line for each group and time: the fields, `time_s`, and means with the ends of their intervals."""
-        return mean_curves(rows, self.by, [column.name for column in self.columns])
+        """Return a line for each group and time: the fields, `time_s`, and means with the ends of their intervals.
+
+        Groups may have other times.
+        """
+        lines = []
+        for key, group in grouped(rows, self.by).items():
+            for point, when in enumerate(group[0]["curves"]["time_s"]):
+                line: dict[str, Any] = dict(zip(self.by, key, strict=True)) | {"time_s": when}
+                for column in self.columns:
+                    name = column.name
+                    values = [{name: row["curves"][name][point]} for row in group]
+                    ends = replace(column, interval=True, factor=1.0).estimate(values)
+                    line |= dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
+                lines.append(line)
+        return lines
 
 
 class Claim(NamedTuple):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import plain
-from training.experiments.statistics import interval, paired_difference
+from training.experiments.statistics import interval
 from training.experiments.tables import console_table, heading, in_words, number
 from training.report.content import (
     CURVES_FILE,
@@ -144,7 +144,7 @@ def _compare_rows(one: Rows, other: Rows) -> list[Difference]:
             common = sorted(own.keys() & others.keys())
             if not common:
                 continue
-            more = paired_difference(others, own)
+            more = np.array([others[seed] - own[seed] for seed in common])
             low, high = interval(more, np.mean)
             means = (float(np.mean([side[seed] for seed in common])) for side in (own, others))
             line = _plain_difference(where, name, *means)

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from training.commands.study import print_table
-from training.experiments.study import Column, Estimate, ResultTable
+from training.experiments.study import Column, Curves, Estimate, ResultTable
 
 TABLE = ResultTable(
     name="maps", title="Maps", by=("policy",),
@@ -35,6 +35,26 @@ def test_lines_and_files_have_the_unit_of_the_heading() -> None:
     assert line["merges undone later"].value == 3
     assert TABLE.cells(line)[1:] == ["75.0 (50.0 .. 100)", "3"]
     assert TABLE.csv([line]).splitlines()[1] == "a_policy_with_a_name,75,50,100,3"
+
+
+def test_seeds_without_a_value_do_not_count() -> None:
+    """Means over time are over the seeds with a value; without any they are None, and one seed has no interval."""
+    curves = Curves(by=("policy",), columns=(Column("coverage"),))
+    values = ([0.1, None, None], [None, None, 0.3], [0.3, None, None], [0.5, None, None])
+    rows = [{"policy": "a", "curves": {"time_s": [0, 1, 2], "coverage": own}} for own in values]
+    first, unknown, alone = curves.lines(rows)
+    assert first["coverage"] == pytest.approx(0.3)
+    assert 0.1 <= first["coverage_low"] < 0.3 < first["coverage_high"] <= 0.5
+    nothing = {"policy": "a", "coverage_low": None, "coverage_high": None}
+    assert unknown == nothing | {"time_s": 1, "coverage": None}
+    assert alone == nothing | {"time_s": 2, "coverage": 0.3}
+
+
+def test_unknown_values_are_dashes_and_small_ones_have_no_sign() -> None:
+    """A line without a value has a dash; a single seed has no interval; a rounded zero is positive."""
+    column = Column("map_error", interval=True)
+    texts = [column.text(column.estimate([{"map_error": value}])) for value in (None, 2.0, -1e-9)]
+    assert texts == ["-", "2.00", "0.000"]
 
 
 def test_functions_get_the_rows_of_differences() -> None:
