@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.scale import memory_mb
 from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, first_seed, option
 from training.experiments.study import Column, ResultTable, Row, Study
@@ -183,15 +184,6 @@ def in_another_process(seed: int, hash_seed: int, steps: int = AGAIN_STEPS) -> s
         [sys.executable, "-c", program], env=os.environ | changed, capture_output=True, text=True, check=True
     )
     return done.stdout.split()[-1]
-
-
-def memory_mb() -> float:
-    """Return the resident memory of this process [MB], or NaN if the system does not report it."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        return float("nan")
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def _memory(place: int, rows: Sequence[Row]) -> float | None:

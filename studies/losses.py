@@ -5,6 +5,7 @@ python -m studies.losses --worlds loops --seeds 4
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
@@ -25,7 +26,6 @@ from training.bench.exploration.players import BOUND, parted, world_split
 from training.bench.exploration.trials import first_steps
 from training.commands.study import run_program
 from training.episodes.config import RunConfig
-from training.episodes.guard import PolicyError
 from training.experiments.config import (
     ONE_PARTICLE,
     ExperimentConfig,
@@ -37,7 +37,6 @@ from training.experiments.config import (
 )
 from training.experiments.policy_names import check_labels
 from training.experiments.study import Column, Curves, ResultTable, Study
-from training.experiments.trial_store import FAILED
 from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 from vslam_env.world.registry import check_source
@@ -166,6 +165,12 @@ def checks(config: Config) -> Iterator[Callable[[], None]]:
         yield partial(first_steps, environment(config, trial), parted(trial.policy), trial.seed, LONGEST_DECISION)
 
 
+def recorded(config: Config, trial: Trial) -> RecordedEpisode:
+    """Run the episode of a trial and record it."""
+    with closing(vslam_v1.parallel_env(config=environment(config, trial))) as env:
+        return record_episode(env, parted(trial.policy).make(env, LONGEST_DECISION), trial.seed)
+
+
 @single_threaded_blas
 def play(config: Config, trial: Trial) -> dict[str, Any]:
     """Run an episode and return the errors of all estimates from its readings.
@@ -185,16 +190,11 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     - `merges`: merges that were not undone; `groups`: groups at the end; `path_m`, `duration_s`, `landmarks`,
       `num_measurements`, `seconds`.
 
-    If the policy fails, the error is returned as `failed`, and no metrics.
+    Raises:
+        PolicyError: If the policy fails.
     """
     begin = time.perf_counter()
-    env = vslam_v1.parallel_env(config=environment(config, trial))
-    try:
-        episode = record_episode(env, parted(trial.policy).make(env, LONGEST_DECISION), trial.seed)
-    except PolicyError as error:
-        return {FAILED: str(error)}
-    finally:
-        env.close()
+    episode = recorded(config, trial)
     options = episode.config.belief.filter
     track = replay(episode, options)
     found = estimates(episode, track)

@@ -7,6 +7,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import combinations, pairwise, product
@@ -21,12 +22,10 @@ from training.bench.exploration.players import parted
 from training.bench.exploration.trials import CURVE_POINTS, TEAM, count_merges, first_steps, pose_errors, values_at
 from training.commands.study import run_program
 from training.episodes.config import RunConfig
-from training.episodes.guard import PolicyError
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, Progress, run_episode
 from training.experiments.config import ONE_PARTICLE, ExperimentConfig, NoisePreset, RobotCount, first_seed, option
 from training.experiments.study import Chart, Column, Curves, Panel, ResultTable, Study
-from training.experiments.trial_store import FAILED
 from vslam_env import save_state, warm_up
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
@@ -135,12 +134,10 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     - `curves`: `time_s`, and at these times `coverage`, `map_error`, `pose_error`, and `step_ms`, the median since the
       time before.
 
-    If the policy fails, the error is returned as `failed`, and no metrics.
+    Raises:
+        PolicyError: If the policy fails.
     """
     _warm_up()
-    env = TimedEnv(environment(config, trial))
-    team = parted(config.policy).make(env, DECISION_LIMIT)
-    begin = time.process_time()
     first: list[float] = []
     ends: list[dict[str, Any]] = []
 
@@ -150,12 +147,10 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
         elif not env.agents:
             ends.append(_snapshot_costs(env))
 
-    try:
+    with closing(TimedEnv(environment(config, trial))) as env:
+        team = parted(config.policy).make(env, DECISION_LIMIT)
+        begin = time.process_time()
         record = run_episode(env, team, trial.seed, watch)
-    except PolicyError as error:
-        return {FAILED: str(error)}
-    finally:
-        env.close()
     taken = 1e3 * np.array(env.seconds)
     late = taken[int((1.0 - LATE_SHARE) * len(taken)) :]
     scores = score_episode(record)["team"]

@@ -11,16 +11,12 @@ import numpy as np
 
 from slam_backend.core.blas import single_threaded_blas
 from studies import losses
-from studies.bounds.episodes import record_episode, replay
+from studies.bounds.episodes import replay
 from studies.bounds.ideal_team import NO_CONTACT, NOT_TRIED, ideal_team, waits_by_reason
-from studies.losses import LONGEST_DECISION, Trial, checks, environment, errors_of, trials
-from training.bench.exploration.players import parted
+from studies.losses import Trial, checks, errors_of, recorded, trials
 from training.commands.study import run_program
-from training.episodes.guard import PolicyError
 from training.experiments.config import NoisePreset, RobotCount, option
 from training.experiments.study import Column, ResultTable, Row, Study
-from training.experiments.trial_store import FAILED
-from vslam_env import vslam_v1
 from vslam_env.config import TICK
 
 
@@ -43,15 +39,12 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
         `map_error` at the end, mean over the robots, `ideal_map_error`, and the `excess` of the former; position RMS
         [m] of both, and their ratio `over_ideal`; `merges` that were not undone, `ideal_merges`; `false_merges` among
         the former; `waits`: seconds from ideal merges to those of the filters, by what kept the groups apart, and their
-        sum `wait_s`. If the policy fails, the error as `failed` alone.
+        sum `wait_s`.
+
+    Raises:
+        PolicyError: If the policy fails.
     """
-    env = vslam_v1.parallel_env(config=environment(config, trial))
-    try:
-        episode = record_episode(env, parted(trial.policy).make(env, LONGEST_DECISION), trial.seed)
-    except PolicyError as error:
-        return {FAILED: str(error)}
-    finally:
-        env.close()
+    episode = recorded(config, trial)
     track, ideal = replay(episode, episode.config.belief.filter), ideal_team(episode)
     own, best = (
         float(np.sqrt((errors_of(p, episode)[..., :2] ** 2).sum(-1).mean())) for p in (track.paths, ideal.paths)

@@ -13,6 +13,7 @@ import pytest
 
 from studies.scale import STUDY, Config, Trial, environment, play, sharing_pairs, trials
 from training.bench.exploration.trials import CURVE_POINTS
+from training.episodes.guard import PolicyError
 
 PROGRAM = [
     sys.executable, "-m", "studies.scale", "--extents", "20,30", "--robots", "2", "--max-seconds", "4", "--particles",
@@ -56,7 +57,8 @@ def test_an_episode_is_timed_and_a_wrong_policy_costs_one_line(monkeypatch: Any,
         "class Failing:\n def reset(self): pass\n def act(self, observation, belief, rng): raise ValueError('gone')\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    assert "gone" in play(config.replace(policy="scale_failing:Failing"), trial)["failed"]
+    with pytest.raises(PolicyError, match="gone"):
+        play(config.replace(policy="scale_failing:Failing"), trial)
 
 
 def test_a_run_is_reported_and_resumed(tmp_path: Path) -> None:

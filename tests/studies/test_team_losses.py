@@ -11,7 +11,8 @@ from slam_backend.maps.alignment import Alignment
 from slam_backend.team.reports import MergeEvent
 from studies.bounds.episodes import record_episode
 from studies.bounds.ideal_team import NO_CONTACT, NOT_TRIED, SHARED, ideal_merges, ideal_team, waits_by_reason
-from studies.team_losses import STUDY, Config, environment, play, trials
+from studies.losses import environment
+from studies.team_losses import STUDY, Config, play, trials
 from training.bench.exploration.players import parted
 from vslam_env import vslam_v1
 

@@ -45,7 +45,7 @@ def run_plan(call: Call[ExplorationConfig], name: str | None, workers: int, clus
     from slam_backend.core.text_files import read_text
     from training.bench.exploration.plan import PLAN_COPY, PlanBench, PlanTrial
     from training.bench.exploration.plan_report import draw_plan, episodes_csv, markdown, ordered, tables, write_parquet
-    from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, checks, play
+    from training.bench.exploration.trials import check_same_policies, checks, play
     from training.experiments.numerics import PORTABLE, variables_for
     from training.experiments.policy_names import check_named
     from training.experiments.tables import E_SCALE
@@ -64,9 +64,8 @@ def run_plan(call: Call[ExplorationConfig], name: str | None, workers: int, clus
         text = f"Floor plans are left out: VSLAM_DATA does not contain {len(missing)} of {len(plan.floor_plans)}."
         console.print(text, soft_wrap=True)
     part = TrialSet(
-        file=TRIALS_FILE, kind=PlanTrial, play=partial(play, bench), trials=trials, workers=workers, cluster=cluster,
+        kind=PlanTrial, play=partial(play, bench), trials=trials, workers=workers, cluster=cluster,
         variables=variables_for(PORTABLE),
-        tell=lambda row: f"{row['part']}, {row['family']}, {row['policy']}, seed {row['seed']}",
     )  # fmt: skip
     rows = run_trial_set(console, folder, part)
     found = [(table, lines) for table in tables(plan, rows) if (lines := table.lines(ordered(rows)))]
@@ -144,13 +143,13 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int, workers
     from slam_backend.core.validation import argument_error
     from training.bench.exploration.leaderboard import kept_episodes
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
-    from training.bench.exploration.trials import TRIALS_FILE, Bench, play
+    from training.bench.exploration.trials import Bench, play
     from training.bench.exploration.verification import TABLE, choose, compare, keep
     from training.experiments.numerics import variables_for
     from training.experiments.policy_names import check_named
     from training.experiments.run_folder import CONFIG_FILE, read_config
     from training.experiments.statistics import grouped
-    from training.experiments.trial_store import FAILED, finished_trials, run_in_processes, trial_of
+    from training.experiments.trial_store import FAILED, TRIALS_FILE, finished_trials, run_in_processes, trial_of
 
     values, seed = read_config(folder, COMMAND, "verify")
     check_named(values.get("policies") or (), call.given.get("policies"))

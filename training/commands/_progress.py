@@ -62,12 +62,10 @@ def trial_progress(
 class TrialSet:
     """Trials of one kind that a run folder stores."""
 
-    file: str  # File with the rows of finished trials
     kind: type[Any]  # Dataclass of a trial
     # Function that runs a trial and returns its row; importable by other processes
     play: Callable[[Any], dict[str, Any]]
     trials: Sequence[Any]  # All trials, in order
-    tell: Callable[[dict[str, Any]], str]  # Short description of a row
     workers: int = 1  # Number of parallel processes; 1: this process, unless there are variables
     cluster: str | None = None  # Address of a Ray cluster that runs the trials instead; None: this machine
     variables: Mapping[str, str] | None = None  # Variables of the environment of the processes that run the trials
@@ -88,9 +86,9 @@ def run_trial_set(console: Console, folder: "RunFolder", part: TrialSet, timed: 
 
 def _run_owned(console: Console, folder: "RunFolder", part: TrialSet, timed: bool) -> list[dict[str, Any]]:
     """Run the missing trials of a folder that no other process uses; see `run_trial_set`."""
-    from training.experiments.trial_store import FAILED, finished_trials, run_trials, trial_of
+    from training.experiments.trial_store import FAILED, TRIALS_FILE, finished_trials, run_trials, trial_of
 
-    found = finished_trials(folder.path / part.file, part.kind)
+    found = finished_trials(folder.path / TRIALS_FILE, part.kind)
     left, wanted = [trial for trial in part.trials if trial not in found], len(part.trials)
     if found:
         text = f"Resuming {folder.path}: {wanted - len(left)} of {wanted} trials are finished, {len(left)} are left."
@@ -105,11 +103,13 @@ def _run_owned(console: Console, folder: "RunFolder", part: TrialSet, timed: boo
                 advance("failed")
                 return
             found[trial_of(row, part.kind)] = row
-            LOGGER.debug("Finished %s", part.tell(row))
-            advance(part.tell(row))
+            values = (row[name] for name in part.kind.__dataclass_fields__)
+            trial = ", ".join(str(value) for value in values if value not in ("", None))
+            LOGGER.debug("Finished %s", trial)
+            advance(trial)
 
         run_trials(
-            folder, part.file, part.play, left, part.workers, interrupted, on_trial, part.cluster, part.variables
+            folder, TRIALS_FILE, part.play, left, part.workers, interrupted, on_trial, part.cluster, part.variables
         )
     rows = [found[trial] for trial in part.trials if trial in found]
     if failed := len(part.failures):

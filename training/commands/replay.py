@@ -12,9 +12,9 @@ from typer.core import TyperGroup
 from training.commands._options import options
 from training.commands._progress import share_progress
 from training.commands._run_folder import Call
+from training.commands.study import write_tables
 from training.episodes.tables import print_consistency, print_tables, write_maps
 from training.experiments.console import print_warning
-from training.experiments.tables import console_table
 from training.replay.config import (
     KITTI,
     MRCLAM,
@@ -232,29 +232,18 @@ def rejuvenation_lines(counts: Mapping[str, Any]) -> list[str]:
 def _align_pairs(call: Call[ImagesConfig], chosen: ImagesConfig) -> None:
     """Align two pairs with each descriptor, print the result, and write the run folder."""
     from slam_backend.frontend import DESCRIPTORS
-    from training.experiments.run_folder import plain
     from training.replay.image_figures import draw_matches
-    from training.replay.stereo_pairs import align_pairs, load_pairs, summarise_pairs
+    from training.replay.stereo_pairs import TABLE, align_pairs, load_pairs, row_of
 
     log = load_pairs(chosen.path, chosen.files)
     console, folder = call.begin(config=chosen)
     order = [chosen.descriptor, *(name for name in DESCRIPTORS if name != chosen.descriptor)]
     results = {name: align_pairs(log, cast(Any, name), chosen.max_range, chosen.seed) for name in order}
-    metrics, main = plain(summarise_pairs(results)), results[chosen.descriptor]
-    kinds = {} if log.poses is None else {"error (m)": ("error_m", 3), "error (degrees)": ("error_deg", 2)}
-    rows = [
-        [
-            name, " + ".join(map(str, row["points"])), str(row["matches"]), str(row["inliers"]),
-            *("none" if row[key] is None else f"{row[key]:.{n}f}" for key, n in kinds.values()),
-        ]
-        for name, row in metrics["alignments"].items()
-    ]  # fmt: skip
-    headings = ("descriptor", "points", "matches", "inliers", *kinds)
-    console.print(console_table("Motion between the two places", headings, rows))
+    main = results[chosen.descriptor]
+    write_tables(call, [TABLE], [row_of(name, result) for name, result in results.items()])
     known = f"The places are {main.true_m:.2f} m and {main.true_deg:.1f} degrees apart."
-    console.print(known if kinds else "Errors: no ground truth in this folder.")
+    console.print("Errors: no ground truth in this folder." if log.poses is None else known)
     if main.motion is not None:
         draw_matches(folder.path / "matches.png", main.images, main.frames, main.motion)
     console.print(write_maps(folder, {str(place): own for place, own in enumerate(main.maps)}), soft_wrap=True)
-    call.write(metrics)
     call.finish()

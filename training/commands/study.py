@@ -18,8 +18,6 @@ from training.commands._run_folder import Call
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.experiments.study import Claim, ResultTable, Row, Study
 
-TRIALS_FILE = "trials.jsonl"
-
 
 def command_of(study: "Study[Any, Any]", command: str) -> Callable[..., None]:
     """Return the function of a study from which typer makes a command.
@@ -69,8 +67,8 @@ def run_study(
     machine = {"machine": describe_machine()} if study.timed else {}
     console, folder = call.begin(*study.checks(call.config))
     part = TrialSet(
-        file=TRIALS_FILE, kind=study.trial, play=partial(_play, study.play, call.config),
-        trials=study.trials(call.config), tell=partial(_told, study.trial), workers=workers, cluster=cluster,
+        kind=study.trial, play=partial(_play, study.play, call.config), trials=study.trials(call.config),
+        workers=workers, cluster=cluster,
     )  # fmt: skip
     rows = study.unfold(run_trial_set(console, folder, part, timed=study.timed))
     write_tables(call, study.tables, rows, study.claims and study.claims(rows), **machine)
@@ -147,15 +145,16 @@ def _longest(*texts: str) -> int:
 
 
 def _play(play: Callable[[Any, Any], Any], config: Any, trial: Any) -> dict[str, Any]:
-    """Play a trial; return its row."""
+    """Play a trial; return its row, with the error as `failed` if the policy fails."""
     from dataclasses import asdict
 
-    return asdict(trial) | dict(play(config, trial))
+    from training.episodes.guard import PolicyError
+    from training.experiments.trial_store import FAILED
 
-
-def _told(kind: type[Any], row: dict[str, Any]) -> str:
-    """Return the fields of a trial that say which one it was."""
-    return ", ".join(str(row[name]) for name in kind.__dataclass_fields__ if row[name] not in ("", None))
+    try:
+        return asdict(trial) | dict(play(config, trial))
+    except PolicyError as error:
+        return asdict(trial) | {FAILED: str(error)}
 
 
 def plain_lines(lines: "Sequence[Row]") -> list[dict[str, Any]]:

@@ -208,13 +208,14 @@ def _epoch_text(rows: "Sequence[Row]") -> str:
 
 def _finish_imitation(call: Call[TrainConfig], imitation: "Imitation", complete: bool, seconds: float) -> None:
     """Write and print the results of the imitation."""
-    from training.rl.curves import draw_imitation, to_csv
+    from training.experiments.tables import csv_of
+    from training.rl.curves import draw_imitation
 
     rows, console, folder = imitation.rows, call.console, call.folder
     best: dict[str, Any] = {}
     if rows:
         best = dict(imitation.best_row)
-        folder.write_text("curves.csv", to_csv(rows))
+        folder.write_text("curves.csv", csv_of(rows))
         draw_imitation(folder.path / "learning.png", rows)
         console.print(
             f"On validation worlds the pupil agrees with the teacher in {100.0 * best['agreement']:.1f} % of the "
@@ -237,11 +238,11 @@ def _rollout_text(row: "Row") -> str:
 
 def _finish(call: Call[TrainConfig], training: "Training", complete: bool, seconds: float) -> None:
     """Write and print the results of the training."""
-    from training.experiments.tables import E_SCALE
-    from training.rl.curves import draw_learning, first_and_last_tenth, to_csv
+    from training.experiments.tables import E_SCALE, csv_of
+    from training.rl.curves import draw_learning, first_and_last_tenth
 
     rows, console, folder = training.rows, call.console, call.folder
-    folder.write_text("curves.csv", to_csv(rows))
+    folder.write_text("curves.csv", csv_of(rows))
     draw_learning(folder.path / "learning.png", rows)
     ends: dict[str, Any] = first_and_last_tenth(rows)
     first, last = ends["first"], ends["last"]

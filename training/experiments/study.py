@@ -20,7 +20,7 @@ from scipy.stats import gmean
 
 from training.experiments.config import ExperimentConfig
 from training.experiments.statistics import differences, grouped, interval
-from training.experiments.tables import csv_text, in_words, markdown_table, number
+from training.experiments.tables import csv_text, heading, in_words, markdown_table, number
 
 Row = Mapping[str, Any]
 ConfigT = TypeVar("ConfigT", bound=ExperimentConfig)
@@ -74,8 +74,7 @@ class Column:
     @property
     def title(self) -> str:
         """Heading with its unit."""
-        words, unit, _ = in_words(self.name)
-        return self.heading or (f"{words} [{unit}]" if unit else words)
+        return self.heading or heading(self.name)
 
     @property
     def scale(self) -> float:
@@ -294,7 +293,7 @@ class Study(Generic[ConfigT, TrialT]):
         trial: Frozen dataclass of a trial.
         trials: Function that returns the trials of a configuration, in order.
         play: Function of configuration and trial that plays it: the fields of its row besides those of the trial. Other
-            processes import it.
+            processes import it. Trials whose policy fails (`PolicyError`), or with a field `failed`, are not kept.
         tables: Tables of the results.
         chart: Chart of the results, or none.
         curves: Curves over time, or none.

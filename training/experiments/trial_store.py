@@ -22,6 +22,7 @@ from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
 LOCK_FILE = ".lock"  # in a run folder: held by the process that adds to it
+TRIALS_FILE = "trials.jsonl"  # file of a run folder with the rows of finished trials
 FAILED = "failed"  # field of the row of a trial without a result: the error, in one line
 
 TrialT = TypeVar("TrialT")

@@ -1,6 +1,5 @@
 """Spatial alignment of two local visual maps of one room, each from a single stereo pair (EuRoC)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.readers.calibration import Rectified, Rectifier
 from slam_backend.readers.stereo_files import StereoFiles, find_pairs, load_rig, truth_file
 from training.experiments.config import Descriptor
+from training.experiments.study import Column, ResultTable
 
 FILES = StereoFiles()
 POSES_FILE = "poses_dev.txt"
@@ -114,18 +114,25 @@ def _map_of(frame: StereoFrame, camera: StereoCamera) -> LandmarkMap:
     return LandmarkMap(points @ turn.T, turn @ camera.covariance(points) @ turn.T, frame.measurements.descriptors)
 
 
-def summarise_pairs(results: Mapping[str, PairsResult]) -> dict[str, Any]:
-    """Return the content of `metrics.json`: a row for each descriptor."""
-    rows = {}
-    for name, result in results.items():
-        motion = result.motion
-        rows[name] = {
-            "points": [len(frame.measurements) for frame in result.frames],
-            "matches": 0 if motion is None else len(motion.pairs),
-            "inliers": 0 if motion is None else int(motion.inliers.sum()), "error_m": result.error_m,
-            "error_deg": result.error_deg, "true_m": result.true_m, "true_deg": result.true_deg,
-        }  # fmt: skip
-    return {"alignments": rows, "robots": [], "merges": [], "groups": [], "coverage": float("nan")}
+def row_of(descriptor: str, result: PairsResult) -> dict[str, Any]:
+    """Return the row of a descriptor."""
+    motion = result.motion
+    return {
+        "descriptor": descriptor,
+        **{f"points_{place}": len(frame.measurements) for place, frame in enumerate(result.frames)},
+        "matches": 0 if motion is None else len(motion.pairs),
+        "inliers": 0 if motion is None else int(motion.inliers.sum()), "error_m": result.error_m,
+        "error_deg": result.error_deg, "true_m": result.true_m, "true_deg": result.true_deg,
+    }  # fmt: skip
+
+
+TABLE = ResultTable(
+    name="motion", title="Motion between the two places", by=("descriptor",),
+    columns=(
+        Column("points_0", "points", digits=0), Column("points_1", "points at the second place", digits=0),
+        Column("matches", digits=0), Column("inliers", digits=0), Column("error_m"), Column("error_deg", digits=2),
+    ),
+)  # fmt: skip
 
 
 def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:

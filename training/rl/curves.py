@@ -1,4 +1,4 @@
-"""Training curves: rows as CSV and as a plot, and the means of the first and last tenth."""
+"""Training curves: plots, and the means of the first and last tenth."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from slam_backend.core.validation import FloatArray
 from training.experiments.plotting import picture, save_png
-from training.experiments.tables import csv_text
 
 Row = Mapping[str, float]
 
@@ -23,12 +22,6 @@ EPOCH_PANELS = (
     ("agreement", "agreement with the teacher"), ("return", "return of the driver"),
 )  # fmt: skip
 COLOUR = "#0072B2"
-
-
-def to_csv(rows: Sequence[Row]) -> str:
-    """Return the rows as CSV with a header, one line per rollout; numbers have six digits."""
-    names = list(rows[0]) if rows else []
-    return csv_text(names, ([row[name] for name in names] for row in rows))
 
 
 def first_and_last_tenth(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:

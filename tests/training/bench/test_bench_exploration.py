@@ -12,9 +12,10 @@ import pytest
 from training.bench.exploration.config import ExplorationConfig, Trial
 from training.bench.exploration.players import label, parted
 from training.bench.exploration.report import STUDY, TABLES
-from training.bench.exploration.trials import CURVE_POINTS, CURVES, TRIALS_FILE, count_merges, play
+from training.bench.exploration.trials import CURVE_POINTS, CURVES, count_merges, play
 from training.episodes.runner import MergeRecord
 from training.experiments.study import Column, ResultTable
+from training.experiments.trial_store import TRIALS_FILE
 from vslam_env import vslam_v0
 
 SMALL = ExplorationConfig(

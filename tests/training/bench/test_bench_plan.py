@@ -34,7 +34,7 @@ from training.bench.exploration.plan_report import (
     tidy_rows,
     write_parquet,
 )
-from training.bench.exploration.trials import TRIALS_FILE
+from training.experiments.trial_store import TRIALS_FILE
 
 FROZEN = {"vslam-bench-v0": "c93f9cc37b4e9f61"}  # by name; a plan that changes gets a new name once it is frozen
 TINY = """

@@ -47,10 +47,7 @@ def play(trial: Trial) -> dict[str, Any]:
 
 
 def _part(seeds: range, play: Callable[[Trial], dict[str, Any]]) -> TrialSet:
-    return TrialSet(
-        file="trials.jsonl", kind=Trial, play=play, trials=[Trial(seed=seed) for seed in seeds],
-        tell=lambda row: f"seed {row['seed']}",
-    )  # fmt: skip
+    return TrialSet(kind=Trial, play=play, trials=[Trial(seed=seed) for seed in seeds])
 
 
 def _console() -> Console:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from training import cli
-from training.commands.study import TRIALS_FILE
 from training.experiments.study import Claim, Estimate
+from training.experiments.trial_store import TRIALS_FILE
 from training.paper.config import Fig6Config
 from training.paper.fig6.claims import check_claims, claim, flat_within, over_robots, paired_ratio
 from training.paper.fig6.report import STUDY

@@ -62,9 +62,9 @@ def test_the_command_compares_descriptors(room: Path, tmp_path: Path) -> None:
     """`vslam replay stereo` writes a row for each descriptor, and a picture of the matches."""
     done = CliRunner().invoke(app, ["replay", "stereo", "--path", str(room), "--out", str(tmp_path / "run")])
     assert done.exit_code == 0, done.output
-    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["alignments"]
-    assert set(rows) == {"usurf", "sift", "orb"}
-    assert all(row["inliers"] > 20 for row in rows.values())
+    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["tables"]["motion"]
+    assert [row["descriptor"] for row in rows] == ["usurf", "sift", "orb"]
+    assert all(row["inliers"] > 20 for row in rows)
     picture = cv2.imread(str(tmp_path / "run" / "matches.png"))
     assert picture.shape == (480, 320, 3)
     assert (picture[:, :, 0] != picture[:, :, 1]).any()
@@ -120,11 +120,12 @@ def test_other_file_names_are_options(room: Path, tmp_path: Path) -> None:
         done = CliRunner().invoke(app, ["replay", "stereo", *arguments, "--out", str(tmp_path / f"run-{out}")])
         assert done.exit_code == 0, done.output
     found = [json.loads((tmp_path / f"run-{out}" / "metrics.json").read_text()) for out in ("usual", "other", "again")]
-    assert found[0]["alignments"] == found[1]["alignments"] == found[2]["alignments"]
-    assert found[0]["alignments"]["usurf"]["error_m"] < 0.03
+    assert found[0]["trials"] == found[1]["trials"] == found[2]["trials"]
+    usurf = found[0]["trials"][0]
+    assert (usurf["descriptor"], usurf["error_m"] < 0.03) == ("usurf", True)
     for place in (0, 1):
         landmarks = LandmarkMap.load(tmp_path / "run-other" / f"map_{place}.npz")
-        assert len(landmarks) == found[0]["alignments"]["usurf"]["points"][place]
+        assert len(landmarks) == usurf[f"points_{place}"]
         assert landmarks.means[:, 0].min() > 1.0  # in front of the camera
 
 

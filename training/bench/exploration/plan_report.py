@@ -27,7 +27,7 @@ from training.experiments.plotting import picture, save_png
 from training.experiments.statistics import grouped
 from training.experiments.study import Chart, Column, Estimate, Panel, ResultTable, Statistic
 from training.experiments.study_chart import COLOURS, STYLES, draw_panel
-from training.experiments.tables import E_SCALE, csv_text, markdown_table, number
+from training.experiments.tables import E_SCALE, csv_of, markdown_table, number
 
 Rows = Sequence[Mapping[str, Any]]
 Values = dict[tuple[str, int], float]  # of worlds, by family and seed
@@ -195,9 +195,7 @@ def tidy_rows(rows: Rows) -> list[dict[str, Any]]:
 
 def episodes_csv(rows: Rows) -> str:
     """Return a line for each episode as CSV; floats have six significant digits."""
-    tidy = tidy_rows(rows)
-    names = list(tidy[0]) if tidy else []
-    return csv_text(names, ([row[name] for name in names] for row in tidy))
+    return csv_of(tidy_rows(rows))
 
 
 def read_episodes(text: str) -> list[dict[str, Any]]:

@@ -21,11 +21,10 @@ from training.episodes.digest import episode_digest
 from training.episodes.guard import PolicyError
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, MergeRecord, run_episode
-from training.experiments.trial_store import FAILED
+from training.experiments.trial_store import FAILED, TRIALS_FILE
 from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 
-TRIALS_FILE = "trials.jsonl"
 HALF, NEARLY_ALL = 0.5, 0.9  # shares of the floor
 WATCHED_S = 20.0  # a wrong merge that persists for this long, or to the end, is false
 CURVE_POINTS = 25
