@@ -8,7 +8,14 @@ from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.reports import Associations, BiasEstimate, PoseEstimate, RejuvenationReport, StepReport
+from slam_backend.fastslam.reports import (
+    Associations,
+    BiasEstimate,
+    PoseEstimate,
+    RejuvenationReport,
+    Relocalisation,
+    StepReport,
+)
 from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.maps.fusion import fuse_landmarks, fuse_maps
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -41,6 +48,7 @@ __all__ = [
     "OdometryModel",
     "PoseEstimate",
     "RejuvenationReport",
+    "Relocalisation",
     "SmoothingOptions",
     "StepReport",
     "StereoCamera",

@@ -19,6 +19,8 @@ This is the recursion of Shiryaev and Roberts [2] with a prior over the frame at
 weak and lasting or strong and short: for each sign S is averaged over its questions and two values of p1. A
 conservative filter, for example one that assumes twice the true noise, shows no sign and raises no alarm.
 
+A robot that was lost and found again (`slam_backend.smoother.relocalisation`) is a warning of its own.
+
 1. A. Ramdas, P. Gruenwald, V. Vovk, G. Shafer: Game-theoretic statistics and safe anytime-valid inference. Statistical
    Science 38(4), 2023.
 2. M. Pollak: Optimal detection of a change in distribution. Annals of Statistics 13(1), 1985.
@@ -29,7 +31,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-from slam_backend.state import Each, Float, Int, Sizes, State
+from slam_backend.fastslam.reports import Relocalisation
+from slam_backend.state import Each, Float, Int, Record, Sizes, State
 
 FALSE_ALARM_RATE = 0.01  # largest share of consistent filters that ever raise a warning, all signs together
 NIS_BOUNDS = (7.81, 11.34)  # 95 and 99 % of chi-square with three degrees of freedom; conservative with two
@@ -54,7 +57,8 @@ HIGHEST = 1e6 * THRESHOLD  # limit of the evidence
 CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
 OVER_CONFIDENT = 4.0  # mean NIS, ideally 3, above which covariances are at least a quarter too small, even in space
 VERDICTS = {  # words for a filter, with their conditions; the first one that holds applies
-    "inconsistent": "a warning",
+    "inconsistent": "a warning, other than of a lost robot",
+    "lost and found": "a robot was lost and found again",
     "unknown": "no measurement has matched a landmark",
     "over-confident": f"mean NIS above {OVER_CONFIDENT:g}",
     "cautious": f"mean NIS below {CAUTIOUS:g}",
@@ -98,6 +102,37 @@ class ConsistencyWarning:
 
 
 @dataclass(frozen=True, slots=True)
+class LostWarning:
+    """A robot that held a wrong pose, until it was found at older landmarks of its map.
+
+    Attributes:
+        step: Step at which it was found.
+        distance: Distance [m] between where it was believed to be and where it was.
+        num_landmarks: Number of landmarks that it had built a second time, now one again.
+    """
+
+    STATE = State(step=Int(), distance=Float(0.0), num_landmarks=Int(1))
+
+    step: int
+    distance: float
+    num_landmarks: int
+
+    @property
+    def sign(self) -> str:
+        """Name of the warning, "lost"."""
+        return "lost"
+
+    @property
+    def text(self) -> str:
+        """Diagnosis and advice."""
+        return (
+            f"Lost, and found at step {self.step}: a robot saw {self.num_landmarks} landmarks again {self.distance:.1f}"
+            " m from where they were held to be; its pose and map are corrected. Check its odometry before: gaps,"
+            " slipping wheels, or a robot that was carried."
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Consistency:
     """Consistency of a filter so far.
 
@@ -108,7 +143,8 @@ class Consistency:
         nis_share: Share of the frames beyond the 95 % bound [-].
         ess_share: Share of the frames with an effective sample size below a tenth of the particles [-].
         rejected_share: Share of the frames with most measurements rejected [-].
-        warnings: One warning for each sign with enough evidence, in the order of `SIGNS`.
+        warnings: One warning for each sign with enough evidence, in the order of `SIGNS`, and one for each time that a
+            robot was lost and found.
     """
 
     frames: int
@@ -116,14 +152,14 @@ class Consistency:
     nis_share: float
     ess_share: float
     rejected_share: float
-    warnings: tuple[ConsistencyWarning, ...]
+    warnings: tuple[ConsistencyWarning | LostWarning, ...]
 
     @property
     def verdict(self) -> str:
         """Key of `VERDICTS`."""
         conditions = (
-            bool(self.warnings), math.isnan(self.nis_mean), self.nis_mean > OVER_CONFIDENT, self.nis_mean < CAUTIOUS,
-            True,
+            any(one.sign != "lost" for one in self.warnings), bool(self.warnings), math.isnan(self.nis_mean),
+            self.nis_mean > OVER_CONFIDENT, self.nis_mean < CAUTIOUS, True,
         )  # fmt: skip
         return next(word for word, holds in zip(VERDICTS, conditions, strict=True) if holds)
 
@@ -152,8 +188,9 @@ class ConsistencyTest:
         counts=Each(Int(), f"{len(SIGN_OF)}", list),
         evidence=Each(Float(0.0), f"{len(WEIGHTS)}", list),
         since=Each(Int(-1), f"{len(SIGNS)}", list),
+        lost=Each(Record(LostWarning), kind=list),
     )
-    __slots__ = ("_begun", "_counts", "_evidence", "_frames", "_matched", "_nis", "_quiet", "_since")
+    __slots__ = ("_begun", "_counts", "_evidence", "_frames", "_lost", "_matched", "_nis", "_quiet", "_since")
 
     def __init__(self) -> None:
         self._frames = 0
@@ -163,6 +200,7 @@ class ConsistencyTest:
         self._counts = [0] * len(SIGN_OF)
         self._evidence = [0.0] * len(WEIGHTS)
         self._since = [-1] * len(SIGNS)  # step of the warning, -1 = none
+        self._lost: list[LostWarning] = []
 
     @staticmethod
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
@@ -191,6 +229,11 @@ class ConsistencyTest:
             self._test(answers + (nis > NIS_BOUNDS[0]) + 2 * (nis > NIS_BOUNDS[1]), step)
         else:
             self._quiet += 1
+
+    def add_relocalisation(self, step: int, found: Relocalisation) -> None:
+        """Add a robot that was found at older landmarks in a step of the filter."""
+        if found.was_lost:
+            self._lost.append(LostWarning(step, found.distance, found.num_landmarks))
 
     def _restart(self) -> None:
         """Start a new product, to detect a filter that fails from here on."""
@@ -226,11 +269,12 @@ class ConsistencyTest:
         """Return the consistency so far."""
         beyond, _, low, rejected = (count / max(self._frames, 1) for count in self._counts)
         shares = (beyond, low, rejected)
-        warnings = tuple(
+        warnings: tuple[ConsistencyWarning | LostWarning, ...] = tuple(
             ConsistencyWarning(sign, since, share)
             for sign, since, share in zip(SIGNS, self._since, shares, strict=True)
             if since >= 0
         )
+        warnings += tuple(self._lost)
         nis_mean = self._nis / self._matched if self._matched else float("nan")
         return Consistency(self._frames, nis_mean, *shares, warnings)
 
@@ -240,6 +284,7 @@ class ConsistencyTest:
         joint = cls()
         joint._frames = joint._begun = a._frames + b._frames
         joint._nis, joint._matched = a._nis + b._nis, a._matched + b._matched
+        joint._lost = sorted([*a._lost, *b._lost], key=lambda one: one.step)
         joint._counts = [one + other for one, other in zip(a._counts, b._counts, strict=True)]
         for sign, both in enumerate(zip(a._since, b._since, strict=True)):
             joint._since[sign] = min((since for since in both if since >= 0), default=-1)

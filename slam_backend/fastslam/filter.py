@@ -56,6 +56,7 @@ from slam_backend.fastslam.reports import (
     PoseEstimate,
     PoseEstimates,
     RejuvenationReport,
+    Relocalisation,
     StepReport,
 )
 from slam_backend.fastslam.run_log import RobotLog, last_step
@@ -516,7 +517,12 @@ class FastSlam:
             return None
         if result.particles is not None:
             self._replace_particles(result.particles)
-        return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
+        found = None
+        if (moved := result.relocated) is not None and result.particles is not None:
+            x, y, heading = moved.shift.tolist()
+            found = Relocalisation(moved.robot, (x, y, heading), len(moved.pairs), moved.was_lost)
+            self._consistency.add_relocalisation(self.next_step - 1, found)
+        return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys, found)
 
     def _replace_particles(self, new: Particles) -> None:
         """Replace the M particles by samples of smoothed paths, with landmarks of the most probable particle so far."""

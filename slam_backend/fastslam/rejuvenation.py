@@ -14,6 +14,7 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.particle_maps import ParticleMaps, present_slots, write_summary
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import compose, inverse, rotate_covariances
+from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.landmark_map import MapSummaryRows
 from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, log_head
@@ -21,7 +22,8 @@ from slam_backend.smoother.joint_graphs import merge_thinned
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
-from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother
+from slam_backend.smoother.rejuvenation import Draft, Particles, Rejuvenation, Smoother
+from slam_backend.smoother.relocalisation import MIN_PAIRS
 from slam_backend.smoother.sampling import PathLandmarks
 from slam_backend.state import MAX_INT, Dict, Each, Flag, Int, Maybe, Record, Sizes, State
 
@@ -41,13 +43,6 @@ def landmark_table(maps: ParticleMaps, best: int) -> LandmarkTable:
     held = counts > 0
     slots, values = slots[held], values[held]
     return LandmarkTable(maps.ids[slots], values[:, :3], values[:, 3:], counts[held], maps.descriptors[slots])
-
-
-def landmark_descriptors(maps: ParticleMaps, gate: float) -> LandmarkDescriptors:
-    """Return the descriptors of landmarks without a caller's name; the gate limits the distance of similar ones."""
-    slots = maps.used_slots()
-    slots = slots[maps.identities[slots] < 0]
-    return LandmarkDescriptors(maps.ids[slots], maps.descriptors[slots], gate)
 
 
 def log_tails(logs: Sequence[RobotLog], graph: SlamGraph, until: SlamGraph | None = None) -> list[LogArrays]:
@@ -317,7 +312,8 @@ class RejuvenationScheduler:
         if reason := self._why_disabled:
             self._restart_interval()
             return _failed(graph, reason)
-        smoother = Smoother(options.motion, camera, options.smoothing, rng)
+        alignment = AlignmentOptions(descriptor_gate=options.descriptor_gate, min_inliers=MIN_PAIRS)
+        smoother = Smoother(options.motion, camera, options.smoothing, rng, alignment)
         self._set_graph(graph)
         is_due = self.is_due  # before slices add the sightings that `effort` weighs
         while True:
@@ -343,9 +339,8 @@ class RejuvenationScheduler:
             outcome = smoother.add_logs(graph, taken, self._initial, landmark_positions(maps, best))
             return self._finish_slice(graph, outcome, lambda: taken, smoother)
         last = self._new_log_rows(logs, graph, maps, best)
-        positions = landmark_positions(maps, best)
-        descriptors = landmark_descriptors(maps, self._options.descriptor_gate)
-        drawn = smoother.draw(graph, last, self._initial, positions, num_particles, descriptors)
+        positions, known = landmark_positions(maps, best), landmark_table(maps, best)
+        drawn = smoother.draw(graph, last, self._initial, positions, num_particles, known)
         if isinstance(drawn, Rejuvenation):
             self._restart_interval()
             self._accept(drawn.graph)

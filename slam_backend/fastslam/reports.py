@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -215,6 +215,30 @@ class StepReport(NamedTuple):
         return tuple([self.all_associations.created(row) for row in self.rows])
 
 
+@dataclass(frozen=True, slots=True)
+class Relocalisation:
+    """A robot that was found at older landmarks of its map, a part of which it had built a second time.
+
+    Attributes:
+        robot: Index of the robot.
+        shift: Where it was, minus where it was believed to be [m, m, rad], map frame.
+        num_landmarks: Number of landmarks that were held twice and are now one.
+        was_lost: Whether the covariance that was claimed for its pose excludes the shift. False: a late loop closure.
+    """
+
+    STATE = State(robot=Int(), shift=Each(Float(), "3"), num_landmarks=Int(1), was_lost=Flag())
+
+    robot: int
+    shift: tuple[float, float, float]
+    num_landmarks: int
+    was_lost: bool
+
+    @property
+    def distance(self) -> float:
+        """Distance between the two [m]."""
+        return math.hypot(*self.shift[:2])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RejuvenationReport:
     """Outcome of an attempt to rejuvenate a filter.
@@ -224,11 +248,21 @@ class RejuvenationReport:
         ess: Effective sample size of the importance weights of whole paths, in [1, M]; NaN if none were computed.
         iterations: Number of iterations of the smoother.
         num_keys: Number of keyframes in the graph.
+        relocalisation: Robot that was found at older landmarks of its map; None: no robot.
     """
 
-    STATE = State(reason=Text(), ess=Float(0.0, nan=True), iterations=Int(), num_keys=Int())
+    STATE = State(
+        reason=Text(), ess=Float(0.0, nan=True), iterations=Int(), num_keys=Int(),
+        relocalisation=Maybe(Record(Relocalisation)),
+    )  # fmt: skip
 
     reason: str
     ess: float
     iterations: int
     num_keys: int
+    relocalisation: Relocalisation | None = None
+
+    def renumbered(self, robots: Sequence[int]) -> Self:
+        """Return the report with robot `robots[i]` for robot i."""
+        found = self.relocalisation
+        return self if found is None else replace(self, relocalisation=replace(found, robot=robots[found.robot]))

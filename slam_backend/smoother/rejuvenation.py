@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
+from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import Keys
@@ -27,6 +28,8 @@ from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise,
 from slam_backend.smoother.log_arrays import REJECTED, LogArrays
 from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
+from slam_backend.smoother.reassociation import LandmarkTable
+from slam_backend.smoother.relocalisation import Relocated, relocalise
 from slam_backend.smoother.sampling import (
     PathLandmarks,
     PathSamples,
@@ -39,20 +42,6 @@ from slam_backend.smoother.sampling import (
 from slam_backend.state import Float, Int, Record, with_state
 
 DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
-
-
-class LandmarkDescriptors(NamedTuple):
-    """Descriptors of landmarks whose ids come from data association.
-
-    Attributes:
-        ids: (n,) int64, ascending.
-        descriptors: (n, d) float32.
-        gate: Largest L2 distance of similar descriptors.
-    """
-
-    ids: IntArray
-    descriptors: NDArray[np.float32]
-    gate: float
 
 
 class Particles(NamedTuple):
@@ -98,6 +87,7 @@ class Rejuvenation(NamedTuple):
         ess: Effective sample size of the importance weights of all draws, at most M; NaN without draws.
         iterations: Iterations of the last descent.
         particles: New particles, or None.
+        relocated: A robot that returned to older landmarks without noticing it, and was moved there; None: no robot.
     """
 
     graph: SlamGraph
@@ -105,6 +95,7 @@ class Rejuvenation(NamedTuple):
     ess: float
     iterations: int
     particles: Particles | None
+    relocated: Relocated | None = None
 
 
 def at_given_poses(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> Rejuvenation:
@@ -140,7 +131,8 @@ def sample_particles(
     num_particles: int,
     rng: np.random.Generator,
     options: SmoothingOptions,
-    appearance: LandmarkDescriptors | None = None,
+    known: LandmarkTable | None = None,
+    descriptor_gate: float = 0.0,
 ) -> Rejuvenation:
     """Draw particles about the mode of a graph.
 
@@ -149,7 +141,8 @@ def sample_particles(
         mode: MAP estimate of the graph with an empty `reason`.
         camera, rng, options: See `Smoother`.
         num_particles: M.
-        appearance: Descriptors to detect duplicate landmarks. None: no detection.
+        known: Landmarks with descriptors, to detect duplicates. None: no detection.
+        descriptor_gate: Largest L2 distance of similar descriptors.
     """
     draws = sample_paths(grown, mode, num_particles, rng)
     ess, needed = draws.sample_size, options.least_ess * num_particles
@@ -157,18 +150,18 @@ def sample_particles(
     graph = reduce_keyframes(relinearise(grown, mode, draws.transition_variances), camera, options, mode.sightings)
     if math.isnan(ess):
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
-    if appearance is not None and len(appearance.ids):
-        duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, appearance), appearance.gate)
+    if known is not None and len(known.ids):
+        duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, known), descriptor_gate)
         if len(duplicates):
             graph = without_unused_frames(without_duplicates(graph, duplicates))
     return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, chosen))
 
 
-def _descriptors(graph: SlamGraph, appearance: LandmarkDescriptors) -> NDArray[np.float32]:
+def _descriptors(graph: SlamGraph, known: LandmarkTable) -> NDArray[np.float32]:
     """Return descriptors (l, d) by row of the graph's landmarks, NaN where unknown."""
-    at = np.minimum(np.searchsorted(appearance.ids, graph.landmark_ids), len(appearance.ids) - 1)
-    result = appearance.descriptors[at]
-    result[appearance.ids[at] != graph.landmark_ids] = np.nan
+    at = np.minimum(np.searchsorted(known.ids, graph.landmark_ids), len(known.ids) - 1)
+    result = known.descriptors[at]
+    result[known.ids[at] != graph.landmark_ids] = np.nan
     return result
 
 
@@ -245,12 +238,14 @@ class Smoother(NamedTuple):
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
         options: Options of the smoother.
         rng: Source of the draws.
+        alignment: Gates and limits with which robots are found at older landmarks of their map.
     """
 
     motion: OdometryModel
     camera: FloatArray
     options: SmoothingOptions
     rng: np.random.Generator
+    alignment: AlignmentOptions
 
     def add_logs(
         self,
@@ -295,7 +290,7 @@ class Smoother(NamedTuple):
         initial_poses: Sequence[InitialPoses],
         places: LandmarkPositions,
         num_particles: int,
-        appearance: LandmarkDescriptors,
+        known: LandmarkTable,
     ) -> Rejuvenation | SlamGraph | Draft | str:
         """Add the logs' last rows to the graph, and draw particles if `LAST_STEPS` iterations reach convergence.
 
@@ -305,7 +300,7 @@ class Smoother(NamedTuple):
         Args:
             graph, logs, initial_poses, places: Same arguments as `add_logs`.
             num_particles: M.
-            appearance: Descriptors to detect duplicate landmarks.
+            known: Landmarks of the filter, to detect duplicates and robots that hold a wrong pose.
 
         Returns:
             The result of the draws, or without draws the same result as `optimise_slice`.
@@ -317,7 +312,17 @@ class Smoother(NamedTuple):
         is_last = not any(map(len, logs))
         mode = optimize(grown, self.camera, self.options, None if is_last else self._most(LAST_STEPS))
         if not mode.reason:
-            return sample_particles(grown, mode, self.camera, num_particles, self.rng, self.options, appearance)
+            relocated = relocalise(relinearise(grown, mode), mode, known, self.alignment)
+            if relocated is not None:
+                moved = optimize(relocated.graph, self.camera, self.options)
+                if moved.reason:
+                    relocated = None
+                else:
+                    grown, mode = relocated.graph, moved
+            drawn = sample_particles(
+                grown, mode, self.camera, num_particles, self.rng, self.options, known, self.alignment.descriptor_gate
+            )
+            return drawn._replace(relocated=relocated)
         if mode.reason == NO_POSE:
             return at_given_poses(grown, self.camera, self.options)
         if is_last and mode.unfinished:

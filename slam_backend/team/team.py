@@ -195,7 +195,7 @@ class TeamSlam:
             if len(routing.robots) > 1:  # a robot without contact sends nothing
                 records.exchange.record_step(report, branch.filter.descriptor_size)
             if report.rejuvenation is not None:
-                rejuvenations += ((routing.robots, report.rejuvenation),)
+                rejuvenations += ((routing.robots, report.rejuvenation.renumbered(branch.robots)),)
         return associations, rejuvenations
 
     def rejuvenate(self) -> tuple[Rejuvenation, ...]:
@@ -209,7 +209,7 @@ class TeamSlam:
         if self.filter_options.rejuvenate_every is None:
             return ()
         branches = [branch for group in self._groups for branch in group.branches]
-        return tuple((branch.active_robots, branch.filter.rejuvenate()) for branch in branches)
+        return tuple((each.active_robots, each.filter.rejuvenate().renumbered(each.robots)) for each in branches)
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the joint filters of two robots' groups with a given alignment, without verification.

@@ -8,13 +8,15 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
+from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import NO_LANDMARK_POSITIONS, InitialPoses, extend_graph
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import MapEstimate
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Rejuvenation, Smoother
+from slam_backend.smoother.reassociation import LandmarkTable
+from slam_backend.smoother.rejuvenation import Draft, Rejuvenation, Smoother
 from training.stereo_runs.batch_problem import BatchProblem
 from training.stereo_runs.runs import RunSpec, StereoRun, simulate_run
 
@@ -58,7 +60,9 @@ def graph_of(run: StereoRun, skip: tuple[int, ...] = (), motion: OdometryModel |
     return extend_graph(start, logs, motion, np.array(run.spec.noise.camera.mount))
 
 
-NAMELESS = LandmarkDescriptors(np.zeros(0, dtype=np.int64), np.zeros((0, 0), dtype=np.float32), 0.0)
+NAMELESS = LandmarkTable(
+    np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros(0, np.int32), np.zeros((0, 0), np.float32)
+)
 
 
 def rejuvenate(
@@ -66,7 +70,7 @@ def rejuvenate(
     rng: np.random.Generator, options: SmoothingOptions,
 ) -> Rejuvenation:  # fmt: skip
     """Add logs to a graph and draw particles: in the first slice, or after those that the descent still needs."""
-    smoother = Smoother(motion, camera, options, rng)
+    smoother = Smoother(motion, camera, options, rng, AlignmentOptions())
     result: Rejuvenation | SlamGraph | Draft | str = graph
     while not isinstance(result, Rejuvenation):
         assert not isinstance(result, str), result

@@ -16,6 +16,7 @@ from slam_backend.fastslam import rejuvenation as scheduler
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import wrap_angle
+from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import rejuvenation
@@ -37,7 +38,7 @@ IN_MANY = replace(IN_SLICES, tolerance=1e-9)  # no descent ends in the slice in 
 def test_slices_give_the_result_of_one_optimisation():
     """Taken in four keys at a time, one Gauss-Newton step a slice, a run has the mode of the whole graph."""
     run = small_run(2)
-    smoother = Smoother(run.spec.noise.motion, camera_of(run), TIGHT, np.random.default_rng(1))
+    smoother = Smoother(run.spec.noise.motion, camera_of(run), TIGHT, np.random.default_rng(1), AlignmentOptions())
     graph, steps = SlamGraph.at_starts(run.true_paths[:, 0]), 0
     logs = [log.arrays() for log in logs_of(run)]
     for upto in range(4, run.num_steps + 4, 4):

@@ -1,0 +1,186 @@
+"""Relocalisation: a robot that holds a wrong pose builds a part of its map twice; both parts tell where it really is.
+
+After a rejuvenation, landmarks of one robot that look like older ones elsewhere in the map are aligned with these, as
+two maps of unknown relative frame are. Where the alignment holds, the robot's path since then is moved, both landmarks
+of a pair become one, and the smoother continues from there. A motion that the claimed covariance of the robot's pose
+allows is a late loop closure: odometry and its noise stay as they are. Otherwise the robot was lost: the odometry is
+cut where fewest landmarks were seen on both sides.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.geometry import compose, rotation, wrap_angle
+from slam_backend.maps.alignment import align_maps
+from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
+from slam_backend.maps.descriptor_matching import similar_pairs
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.smoother.duplicates import without_duplicates
+from slam_backend.smoother.graph import UNINFORMATIVE, SlamGraph
+from slam_backend.smoother.graph_reduction import without_unused_frames
+from slam_backend.smoother.optimizer import MapEstimate
+from slam_backend.smoother.reassociation import LandmarkTable
+
+MIN_PAIRS = 5  # landmarks seen again
+LOST = 16.27  # squared Mahalanobis distance of the motion beyond which the pose was wrong, 99.9 % of 3 degrees
+
+
+class Relocated(NamedTuple):
+    """A graph with a robot at its own older landmarks.
+
+    Attributes:
+        robot: Index of the robot.
+        shift: (3,) float64 [m, m, rad], map frame. Where it is, minus where it was believed to be.
+        distance_sq: Squared Mahalanobis distance [-] of the shift, by the claimed covariance.
+        pairs: (n, 2) int64 rows (id of the later landmark, id of the older one).
+        graph: Graph with the moved path and without the later landmarks, before the next descent.
+    """
+
+    robot: int
+    shift: FloatArray
+    distance_sq: float
+    pairs: IntArray
+    graph: SlamGraph
+
+    @property
+    def was_lost(self) -> bool:
+        """Whether the claimed covariance excludes the motion."""
+        return self.distance_sq > LOST
+
+
+class _Sightings(NamedTuple):
+    """First and last key (l,) from which a robot saw each landmark, and the later of both for all other robots."""
+
+    first: IntArray
+    last: IntArray
+    by_others: IntArray
+
+
+UNSEEN = -1
+
+
+def relocalise(
+    graph: SlamGraph, mode: MapEstimate, known: LandmarkTable, options: AlignmentOptions
+) -> Relocated | None:
+    """Return the robot whose later landmarks are older ones of the map; None if there is none.
+
+    Args:
+        graph: Graph at its mode.
+        mode: MAP estimate of the graph.
+        known: Landmarks of the map whose ids come from data association.
+        options: Gates, and limits of the alignment.
+    """
+    rows = np.flatnonzero(np.isin(graph.landmark_ids, known.ids))
+    if len(rows) < 2 * MIN_PAIRS:
+        return None
+    at = np.searchsorted(known.ids, graph.landmark_ids[rows])
+    looks = known.descriptors[at]
+    alike = similar_pairs(looks, looks, options.descriptor_gate, options.max_similar + 1)  # each is like itself
+    alike = alike[alike[:, 0] != alike[:, 1]]
+    for robot in range(len(graph.last_keys)) if len(alike) >= 2 * MIN_PAIRS else ():
+        seen = _sightings(graph, robot)
+        split = _split(seen, rows[alike])
+        if split is None:
+            continue
+        later = (seen.first[rows] >= split) & (seen.by_others[rows] == UNSEEN)
+        old, new = (_map_of(graph, known, rows[which], at[which]) for which in (~later, later))
+        found = align_maps(old, new, options=options)
+        if found.success:
+            pairs = np.column_stack([new.ids[found.inliers[:, 1]], old.ids[found.inliers[:, 0]]])
+            relocated = _moved(graph, robot, found, pairs, seen, mode)
+            if relocated is not None:
+                return relocated
+    return None
+
+
+def _sightings(graph: SlamGraph, robot: int) -> _Sightings:
+    """Return which landmarks a robot saw, and when."""
+    keys = np.concatenate([graph.condensed_keys, graph.frame_keys[graph.point_frames]])
+    landmarks = np.concatenate([graph.condensed_landmarks, graph.point_landmarks])
+    own = graph.robots[keys] == robot
+    count = len(graph.landmark_ids)
+    first, last, by_others = np.full(count, graph.num_keys), np.full(count, UNSEEN), np.full(count, UNSEEN)
+    np.minimum.at(first, landmarks[own], keys[own])
+    np.maximum.at(last, landmarks[own], keys[own])
+    np.maximum.at(by_others, landmarks[~own], keys[~own])
+    first[last == UNSEEN] = UNSEEN
+    return _Sightings(first, last, by_others)
+
+
+def _split(seen: _Sightings, alike: IntArray) -> int | None:
+    """Return the key from which a robot sees most landmarks for the first time that look like those seen before alone.
+
+    Args:
+        seen: Sightings of the robot.
+        alike: (n, 2) pairs of landmarks that look alike, each in both orders.
+    """
+    old, new = alike.T
+    apart = (seen.last[old] < seen.first[new]) & (seen.by_others[new] == UNSEEN)
+    ended = np.full(len(seen.first), np.iinfo(np.int64).max)
+    np.minimum.at(ended, new[apart], seen.last[old[apart]])
+    later = np.flatnonzero(ended < seen.first)
+    begins = seen.first[later]
+    counts = ((ended[later] < begins[:, None]) & (begins >= begins[:, None])).sum(axis=1)
+    return int(begins[counts == counts.max()].min()) if counts.max(initial=0) >= MIN_PAIRS else None
+
+
+def _map_of(graph: SlamGraph, known: LandmarkTable, rows: IntArray, at: IntArray) -> LandmarkMap:
+    """Return landmarks of a graph as a map."""
+    return LandmarkMap(
+        graph.landmarks[rows], known.covariances[at][:, UNPACK_INDEX], known.descriptors[at],
+        ids=graph.landmark_ids[rows],
+    )  # fmt: skip
+
+
+def _moved(
+    graph: SlamGraph, robot: int, found: Alignment, pairs: IntArray, seen: _Sightings, mode: MapEstimate
+) -> Relocated | None:
+    """Return the graph with the robot's later path at its older landmarks; None if no unknown pose lies between."""
+    row = {int(name): i for i, name in enumerate(graph.landmark_ids)}
+    new, old = (np.array([row[int(name)] for name in names]) for names in pairs.T)
+    keys = np.flatnonzero((graph.robots == robot) & (mode.columns >= 0))
+    begin = int(seen.first[new].min())
+    end = int(seen.last[old][seen.last[old] < begin].max(initial=UNSEEN))
+    newest = graph.last_keys[robot]
+    shift, distance_sq = _shift(found, graph.poses[newest], mode.covariance(np.array([newest])))
+    between_parts = keys[(keys > end) & (keys <= begin)]
+    if not len(between_parts):
+        return None
+    shares = np.zeros(graph.num_keys)
+    shares[keys[keys > begin]] = 1.0
+    noises, variances = graph.odometry_covariances, graph.transition_variances
+    if distance_sq > LOST:
+        bridging = [np.count_nonzero((seen.first >= 0) & (seen.first < at) & (seen.last >= at)) for at in between_parts]
+        cut = int(between_parts[len(bridging) - 1 - int(np.argmin(bridging[::-1]))])  # the last of equal ones
+        shares[keys[keys >= cut]] = 1.0
+        noises, variances = noises.copy(), variances.copy()
+        noises[cut], variances[cut] = np.diag(UNINFORMATIVE), UNINFORMATIVE[0]
+    else:
+        shares[between_parts] = np.arange(1, len(between_parts) + 1) / len(between_parts)
+    poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
+    for key in np.flatnonzero(shares):
+        poses[key] = compose(shares[key] * found.transform, poses[key])
+    own = np.flatnonzero((seen.by_others == UNSEEN) & (seen.first >= 0))
+    for landmark in own[shares[seen.first[own]] > 0.0]:
+        share = shares[seen.first[landmark]] * found.transform
+        landmarks[landmark, :2] = rotation(share[2]) @ landmarks[landmark, :2] + share[:2]
+    joined = without_duplicates(
+        graph.with_columns(
+            poses=poses, landmarks=landmarks, odometry_covariances=noises, transition_variances=variances
+        ),
+        pairs,
+    )
+    return Relocated(robot, shift, distance_sq, pairs, without_unused_frames(joined))
+
+
+def _shift(found: Alignment, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
+    """Return the moved pose minus the pose (3,), and its squared Mahalanobis distance."""
+    moved = compose(found.transform, pose)
+    off = moved - pose
+    off[2] = wrap_angle(off[2])
+    lever = np.eye(3)
+    lever[:2, 2] = -(moved[1] - found.ty), moved[0] - found.tx
+    return off, float(off @ np.linalg.solve(covariance + lever @ found.covariance @ lever.T, off))

@@ -1,0 +1,222 @@
+"""Robots that are carried off: how soon filters notice, and whether they find themselves again.
+
+python -m studies.kidnaps --seeds 20
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.blas import single_threaded_blas
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.geometry import compose, inverse, wrap_angle
+from slam_backend.models.measurements import Measurements
+from studies.bounds.episodes import record_episode
+from studies.mistakes import MOTION, circle_log
+from training.bench.exploration.players import parted
+from training.commands.study import run_program
+from training.experiments.config import ExperimentConfig, first_seed, option
+from training.experiments.study import Column, ResultTable, Study
+from training.replay.config import MRCLAM, find_log
+from training.replay.metrics import true_poses
+from training.replay.readers import read_mrclam
+from vslam_env import preset_config, vslam_v1
+
+World = Literal["circle", "office", "mrclam"]
+JUMP = np.array([3.0, 2.0, 1.0])  # [m, m, rad] by which one odometry reading is wrong
+CUT = 100.0  # [s] of a log that are left out
+KNOWN = 5  # landmarks seen again after which a robot could know
+IN_TIME = 50  # steps within which it should
+
+# ---------------------------------------------------------------------- trials
+
+
+class Config(ExperimentConfig):
+    """Robots that are carried off once, and robots that are not."""
+
+    worlds: tuple[World, ...] = option(
+        ("circle", "office", "mrclam"), "Worlds: circle (of the SLAM tutorial), office, mrclam (data set 7)."
+    )
+    seeds: int = option(20, "Number of trials in each world.", ge=1, hint="Use at least one.")
+    seed: int = first_seed()
+    preset: Literal["standard", "hard"] = option("standard", "Noise preset in offices.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One robot."""
+
+    world: World
+    kidnapped: bool  # Whether the robot is carried off
+    seed: int  # Seed of the noise, the filter, and the time
+
+
+def trials(config: Config) -> list[Trial]:
+    """Return all trials."""
+    return [
+        Trial(world=world, kidnapped=kidnapped, seed=seed)
+        for world in config.worlds
+        for seed in range(config.seed, config.seed + config.seeds)
+        for kidnapped in (True, False)
+    ]
+
+
+class Drive(NamedTuple):
+    """Readings of a robot in T steps, with the true landmark of each measurement, and its true path."""
+
+    odometry: FloatArray  # (T, 3) float64 [m, m, rad]
+    frames: Sequence[Measurements | None]
+    true_ids: Sequence[IntArray]  # Negative: of no landmark
+    true_path: FloatArray  # (T, 3) float64 [m, m, rad]; NaN where it is unknown
+    options: dict[str, Any]  # Of the filter
+
+    def without(self, begin: int, end: int) -> "Drive":
+        """Return the drive without some steps, as if the robot had been carried."""
+        kept = [step for step in range(len(self.odometry)) if not begin <= step < end]
+        path = self.true_path[kept]
+        return Drive(
+            self.odometry[kept], [self.frames[i] for i in kept], [self.true_ids[i] for i in kept], path, self.options
+        )
+
+
+@lru_cache(maxsize=2)
+def drive(world: World, seed: int, preset: Literal["standard", "hard"]) -> Drive:
+    """Return a drive in a world; of data set 7 robots and parts differ between seeds."""
+    if world == "circle":
+        log = circle_log("none", seed)
+        path = np.zeros((len(log.odometry), 3))
+        for step in range(1, len(path)):
+            path[step] = compose(path[step - 1], np.array([0.2, 0.0, 0.05]))
+        return Drive(log.odometry, log.measurements, log.identities, path, {"motion": MOTION})
+    if world == "office":
+        player = parted("frontier@continuous")
+        config = preset_config(preset).replace(
+            world="office", num_robots=1, max_seconds=120.0, action_type=player.action_type
+        )
+        env = vslam_v1.parallel_env(config=config, observation_keys=player.observation_keys)
+        episode = record_episode(env, player.make(env, 600.0), seed)
+        env.close()
+        chosen = config.belief.filter
+        return Drive(
+            np.vstack([np.zeros(3), episode.odometry[0]]), [own[0].measurements for own in episode.readings],
+            [ids[0] for ids in episode.true_ids], episode.true_paths[0],
+            {field.name: getattr(chosen, field.name) for field in fields(FilterOptions)},
+        )  # fmt: skip
+    place = find_log(None, MRCLAM, "the folder of MR.CLAM data set 7")
+    read = read_mrclam(place, robots=(1 + seed % 5,), alone=True)
+    robot = read.robots[0]
+    assert robot.odometry is not None
+    assert robot.identities is not None
+    frames = [
+        None if frame is None else Measurements(frame.points, _badges(names), frame.covariances)
+        for frame, names in zip(robot.measurements, robot.identities, strict=True)
+    ]
+    truth = true_poses(robot.truth, read.times)
+    ids = [np.asarray([] if names is None else names, np.int64) for names in robot.identities]
+    return Drive(robot.odometry, frames, ids, truth, {"motion": read.options["motion"]})  # gates for descriptors
+
+
+def _badges(names: IntArray) -> NDArray[np.float32]:
+    """Return descriptors (n, 32) of MR.CLAM's landmarks that tell them apart, as their barcodes do."""
+    return np.asarray(np.eye(32, dtype=np.float32)[np.asarray(names, np.int64) % 32])
+
+
+@single_threaded_blas
+def play(config: Config, trial: Trial) -> dict[str, Any]:
+    """Run the filter on a drive.
+
+    Returns:
+        `warned`: whether a warning says that the robot was lost; `others`: number of warnings before it was carried off
+        or without; `worse`: number of relocalisations that made the error of the pose larger. `delay`: steps from the
+        first sight of five known landmarks until the warning, and `in_time`: whether it is at most `IN_TIME`; None if
+        five are never seen again. `before_m`, `lost_m`, `end_m`: position error before, the largest afterwards, and at
+        the end. `copies`: landmarks of the map for each true one.
+    """
+    own = drive(trial.world, trial.seed, config.preset)
+    count, rng = len(own.odometry), np.random.default_rng((trial.seed, 1))
+    at = int(count * rng.uniform(0.4, 0.6))
+    odometry = own.odometry.copy()
+    if trial.kidnapped and trial.world == "mrclam":
+        own = own.without(at, at + int(CUT * 4))
+        odometry = own.odometry.copy()
+        odometry[at] = 0.0
+    elif trial.kidnapped:
+        odometry[at] = compose(odometry[at], JUMP)
+    slam = FastSlam(seed=trial.seed, **own.options)
+    path, moved = np.zeros((count, 3)), []
+    for step in range(len(odometry)):
+        report = slam.step([odometry[step]], [own.frames[step]])
+        path[step] = slam.pose().mean
+        if report.rejuvenation is not None and report.rejuvenation.relocalisation is not None:
+            moved.append(step)
+    warnings = [one.step for one in slam.consistency.warnings if one.sign == "lost"]
+    known = {int(name) for names in own.true_ids[:at] for name in names if name >= 0}
+    could = next(_known_again(own.true_ids, at, known), None) if trial.kidnapped else None
+    late = next((step for step in warnings if step >= at), None) if trial.kidnapped else None
+    off = path[: len(odometry)] - _in_start_frame(own.true_path)
+    errors, apart = np.hypot(*off[:, :2].T), np.abs(wrap_angle(off[:, 2]))
+    return {
+        "warned": late is not None, "could": could is not None,
+        "others": len([step for step in warnings if step < at or not trial.kidnapped]),
+        "worse": sum(bool(errors[n] + apart[n] > errors[n - 1] + apart[n - 1]) for n in moved),
+        "moved": len(moved), "delay": None if could is None or late is None else late - could,
+        "in_time": None if could is None else late is not None and late - could <= IN_TIME,
+        "before_m": float(np.nanmax(errors[: at - 1][-50:])), "lost_m": float(np.nanmax(errors[at:])),
+        "end_m": float(errors[~np.isnan(errors)][-1]),
+        "copies": slam.map_size / max(len({int(n) for names in own.true_ids for n in names if n >= 0}), 1),
+    }  # fmt: skip
+
+
+def _known_again(true_ids: Sequence[IntArray], at: int, known: set[int]) -> Iterator[int]:
+    """Yield the steps from `at` on by which enough known landmarks were seen again."""
+    seen: set[int] = set()
+    for step in range(at, len(true_ids)):
+        seen |= known & {int(name) for name in true_ids[step]}
+        if len(seen) >= KNOWN:
+            yield step
+
+
+def _in_start_frame(path: FloatArray) -> FloatArray:
+    known = np.flatnonzero(~np.isnan(path[:, 0]))
+    return compose(inverse(path[known[0]]), path)
+
+
+# ---------------------------------------------------------------------- results
+
+
+STUDY = Study(
+    name="kidnaps",
+    about="""Carry robots off, and see how soon filters notice it, and whether they find themselves again.
+
+    In the circle and in offices one odometry reading is wrong by 3 m, 2 m and 1 rad; of a real log a part is left out.
+    Robots that are not carried off show false alarms.
+    """,
+    config=Config,
+    trial=Trial,
+    trials=trials,
+    play=play,
+    quick={"worlds": ("circle",), "seeds": 2},
+    tables=(
+        ResultTable(
+            name="kidnaps", title="Robots that are carried off, and others", by=("world", "kidnapped"),
+            columns=(
+                Column("warned", "lost [%]", digits=0, factor=100.0), Column("others", "others", "sum", digits=0),
+                Column("moved", "found", "sum", digits=0), Column("worse", "worse", "sum", digits=0),
+                Column("could", "could [%]", digits=0, factor=100.0),
+                Column("in_time", "soon [%]", digits=0, factor=100.0),
+                Column("delay", "delay [steps]", "median", digits=0), Column("before_m", "before [m]", digits=2),
+                Column("lost_m", "worst [m]", digits=2), Column("end_m", "end [m]", "median", digits=2),
+                Column("copies", digits=2),
+            ),
+        ),
+    ),
+)  # fmt: skip
+
+if __name__ == "__main__":
+    run_program(STUDY)
