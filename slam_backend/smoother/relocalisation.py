@@ -1,10 +1,13 @@
 """Relocalisation: a robot that holds a wrong pose builds a part of its map twice; both parts tell where it really is.
 
-After a rejuvenation, landmarks of one robot that look like older ones elsewhere in the map are aligned with these, as
-two maps of unknown relative frame are. Where the alignment holds, the robot's path since then is moved, both landmarks
-of a pair become one, and the smoother continues from there. A motion that the claimed covariance of the robot's pose
-allows is a late loop closure: odometry and its noise stay as they are. Otherwise the robot was lost: the odometry is
-cut where fewest landmarks were seen on both sides.
+Landmarks of one robot that look like older ones that it saw elsewhere are aligned with these, as two maps of unknown
+relative frame are. Where the alignment holds, the robot's path since then is moved, both landmarks of a pair become
+one, and the smoother continues from there. A motion that the claimed covariance of the robot's pose allows is a late
+loop closure: odometry and its noise stay as they are. Otherwise the robot was lost: the odometry is cut where fewest
+landmarks were seen on both sides.
+
+Landmarks that only other robots saw do not count: where these disagree, the start of the robot may be wrong and not its
+odometry, and a merge is to be undone.
 """
 
 from typing import NamedTuple
@@ -85,8 +88,9 @@ def relocalise(
         split = _split(seen, rows[alike])
         if split is None:
             continue
-        later = (seen.first[rows] >= split) & (seen.by_others[rows] == UNSEEN)
-        old, new = (_map_of(graph, known, rows[which], at[which]) for which in (~later, later))
+        first = seen.first[rows]
+        parts = (first >= 0) & (first < split), (first >= split) & (seen.by_others[rows] == UNSEEN)
+        old, new = (_map_of(graph, known, rows[part], at[part]) for part in parts)
         found = align_maps(old, new, options=options)
         if found.success:
             pairs = np.column_stack([new.ids[found.inliers[:, 1]], old.ids[found.inliers[:, 0]]])
@@ -118,7 +122,7 @@ def _split(seen: _Sightings, alike: IntArray) -> int | None:
         alike: (n, 2) pairs of landmarks that look alike, each in both orders.
     """
     old, new = alike.T
-    apart = (seen.last[old] < seen.first[new]) & (seen.by_others[new] == UNSEEN)
+    apart = (seen.last[old] >= 0) & (seen.last[old] < seen.first[new]) & (seen.by_others[new] == UNSEEN)
     ended = np.full(len(seen.first), np.iinfo(np.int64).max)
     np.minimum.at(ended, new[apart], seen.last[old[apart]])
     later = np.flatnonzero(ended < seen.first)
