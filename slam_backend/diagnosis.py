@@ -39,7 +39,7 @@ UNIT_WITHIN = math.log(1.5)  # of the ratio between two units
 AGREED = 0.7  # length of the mean of unit vectors; below it directions do not agree
 MOST_SPREAD = 0.2  # of a ratio, robust standard deviation of a window; beyond it a scale is not told
 NOISY = 10.0  # times the assumed standard deviation of odometry
-NOISY_POINTS = 14.0  # the same of points; a car on a road leaves up to 13, as it pitches and rolls
+NOISY_POINTS = 18.0  # the same of points; drifting features of a car that pitches and rolls leave up to 17
 FITTING = 5.0  # the same; points beyond it do not judge the odometry's noise
 HALF_CHI_SQUARE, CHI_SQUARE_2 = 0.455, 1.386  # medians of chi-square with one degree of freedom and with two
 
@@ -75,6 +75,8 @@ CAUSES = {  # what is said of each cause; `{ratio}` is what was found
     "calibration of the wheels.",
     "scale of turns": "The sightings turn {ratio:.2f} times as far as the odometry: check the field of view or focal "
     "length, and the track of the wheels.",
+    "delay": "The odometry's turns come {ratio:.0f} steps after those of the sightings (before them if negative): "
+    "check the time stamps.",
     "measurement noise": "Points differ by {ratio:.0f} times the assumed noise: assume more measurement noise, or check"
     " the association of the measurements.",
     "odometry noise": "Motions differ by {ratio:.0f} times the assumed noise: assume more odometry noise, or check the "
@@ -93,6 +95,7 @@ class Motions:
         turns: (N,) float64 [rad]. Sum of the odometry's turns.
         variances: (N, 2) float64 [m^2, rad^2]. Assumed variances of both sums, along the motion and of the turn.
         fits: (N,) float64 [-]. Median squared residual of the points, in units of their assumed noise.
+        windows: (N, 2) int64. First and last step of each window.
     """
 
     sighted: FloatArray
@@ -101,6 +104,7 @@ class Motions:
     turns: FloatArray
     variances: FloatArray
     fits: FloatArray
+    windows: IntArray
 
 
 def diagnose(
@@ -129,7 +133,29 @@ def diagnose(
             raise argument_error(name, f"a list of {len(odometry)} entries, one for each step", got, "Give them all.")
     camera = StereoCamera() if camera is None else camera
     found = find_motions(odometry, measurements, identities, camera, OdometryModel() if motion is None else motion)
-    return () if len(found.turns) < LEAST_WINDOWS else name_causes(found)
+    if len(found.turns) < LEAST_WINDOWS:
+        return ()
+    late = find_delay(odometry[:, 2], found)
+    return (_cause("delay", late),) if late else name_causes(found)
+
+
+def find_delay(turns: FloatArray, found: Motions) -> int:
+    """Return the steps by which the odometry's turns (T,) lag behind those of the sightings; 0 if none are clear.
+
+    With the right delay both agree as well as is assumed, and without one they do not.
+    """
+    heading = np.cumsum(turns)
+    variances = found.variances[:, 1] + found.covariances[:, 2, 2]
+    misfits = {}
+    for late in range(-WINDOW, WINDOW + 1):
+        first, last = found.windows.T + late
+        held = (first >= 0) & (last < len(turns))
+        off = found.sighted[held, 2] - (heading[last[held]] - heading[first[held]])
+        misfits[late] = (
+            math.sqrt(float(np.median(off**2 / variances[held])) / HALF_CHI_SQUARE) if held.any() else np.inf
+        )
+    best = min(misfits, key=lambda late: (misfits[late], abs(late)))
+    return best if 2.0 * misfits[best] < FITTING < misfits[0] else 0
 
 
 def find_motions(
@@ -153,13 +179,14 @@ def find_motions(
             noise = motion.variances(odometry[between]).sum(axis=0)[[0, 2]] + bias[:2] * distances[between].sum() ** 2
             before, after = (_in_robot(measurements[step], camera) for step in (first, last))
             told = sighted_motion(before, after, pairs)
-            rows.append((*told, odometry[between, :2].sum(axis=0), odometry[between, 2].sum(), noise))
+            rows.append((*told, odometry[between, :2].sum(axis=0), odometry[between, 2].sum(), noise, (first, last)))
             place = begun + count
             break
-    sighted, covariances, fits, translations, turns, variances = zip(*rows, strict=True) if rows else ((),) * 6
+    sighted, covariances, fits, translations, turns, variances, windows = zip(*rows, strict=True) if rows else ((),) * 7
     return Motions(
         np.reshape(sighted, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), np.reshape(translations, (-1, 2)),
         np.array(turns, np.float64), np.reshape(variances, (-1, 2)), np.array(fits, np.float64),
+        np.reshape(np.array(windows, np.int64), (-1, 2)),
     )  # fmt: skip
 
 
@@ -176,7 +203,8 @@ def sighted_motion(
     every = np.ones(len(pairs), np.bool_)
     covariance = np.linalg.pinv(information(table, every, motion, MIN_VARIANCE)[0], hermitian=True)
     distances = squared_distances(table, motion, MIN_VARIANCE)
-    return motion, np.asarray(covariance, np.float64), float(np.median(distances)) / CHI_SQUARE_2
+    freedom = 1.0 - 3.0 / (2.0 * len(pairs))  # the fit of three numbers takes its share of the residuals
+    return motion, np.asarray(covariance, np.float64), float(np.median(distances)) / (freedom * CHI_SQUARE_2)
 
 
 def match(

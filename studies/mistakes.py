@@ -78,7 +78,8 @@ def circle_log(mistake: Mistake, seed: int) -> CircleLog:
         near = np.flatnonzero((body[:, 0] > 0.5) & (np.abs(body[:, 1]) < body[:, 0]) & (np.hypot(*body.T) < 6.0))
         points = np.column_stack([-body[near, 1], np.zeros(len(near)), body[near, 0]])
         points = _wrong_points(points + rng.normal(0.0, noise, points.shape), mistake)
-        frames.append(Measurements(points, (looks[near] + rng.normal(0.0, 0.02, (len(near), 64))).astype(np.float32)))
+        described = (looks[near] + rng.normal(0.0, 0.02, (len(near), 64))).astype(np.float32)
+        frames.append(Measurements(points, described, np.tile(POINT_NOISE**2 * np.eye(3), (len(near), 1, 1))))
         names.append(near)
     if mistake == "odometry noise":
         odometry[1:] += rng.normal(0.0, 1.0, (STEPS - 1, 3)) * TOO_NOISY * np.sqrt(MOTION.variances(odometry[1:]))

@@ -64,18 +64,20 @@ VERDICTS = {  # words for a filter, with their conditions; the first one that ho
     "cautious": f"mean NIS below {CAUTIOUS:g}",
     "consistent": f"mean NIS from {CAUTIOUS:g} to {OVER_CONFIDENT:g}",
 }
+SET_UP = "First check units, signs and time stamps (`slam_backend.diagnosis.diagnose` names likely mistakes)"
 ADVICE = {  # diagnosis and advice by sign
     "nis": (
         "the innovations exceed their predicted covariances, the filter is over-confident",
-        "Assume more odometry noise or measurement noise, lower rejuvenate_every, or use more particles.",
+        f"{SET_UP}; then assume more odometry noise or measurement noise, lower rejuvenate_every, or use more"
+        " particles.",
     ),
     "ess": (
         "less than a tenth of the particles carry all the weight",
-        "Use more particles, lower rejuvenate_every, or assume more measurement noise.",
+        f"{SET_UP}; then use more particles, lower rejuvenate_every, or assume more measurement noise.",
     ),
     "rejected": (
         "most measurements match no landmark and start none",
-        "Assume more odometry noise, or check time stamps and units.",
+        f"{SET_UP}; then assume more odometry noise.",
     ),
 }
 

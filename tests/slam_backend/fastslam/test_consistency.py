@@ -84,7 +84,7 @@ def test_mismatched_odometry_is_found(changes: dict[str, Any]) -> None:
     """Odometry three times as bad as assumed, or with a biased turn, is reported within 250 steps, with what to try."""
     told = [life(seed, **changes).consistency for seed in range(3)]
     assert all("nis" in [warning.sign for warning in one.warnings] for one in told)
-    assert "Assume more odometry noise" in told[0].warnings[0].text
+    assert "assume more odometry noise" in told[0].warnings[0].text
     assert told[0].to_mapping()["warnings"][0]["text"] == told[0].warnings[0].text
 
 
