@@ -39,7 +39,7 @@ UNIT_WITHIN = math.log(1.5)  # of the ratio between two units
 AGREED = 0.7  # length of the mean of unit vectors; below it directions do not agree
 MOST_SPREAD = 0.2  # of a ratio, robust standard deviation of a window; beyond it a scale is not told
 NOISY = 10.0  # times the assumed standard deviation of odometry
-NOISY_POINTS = 18.0  # the same of points; drifting features of a car that pitches and rolls leave up to 17
+NOISY_POINTS = 14.0  # the same of points; drifting features of a car that pitches and rolls leave up to 13.5
 FITTING = 5.0  # the same; points beyond it do not judge the odometry's noise
 HALF_CHI_SQUARE, CHI_SQUARE_2 = 0.455, 1.386  # medians of chi-square with one degree of freedom and with two
 
@@ -94,7 +94,8 @@ class Motions:
         translations: (N, 2) float64 [m]. Sum of the odometry's translations, each in its own robot frame.
         turns: (N,) float64 [rad]. Sum of the odometry's turns.
         variances: (N, 2) float64 [m^2, rad^2]. Assumed variances of both sums, along the motion and of the turn.
-        fits: (N,) float64 [-]. Median squared residual of the points, in units of their assumed noise.
+        fits: (n,) float64 [-]. Squared residuals of the points of all windows, in units of their assumed noise; their
+            median is one if this is right.
         windows: (N, 2) int64. First and last step of each window.
     """
 
@@ -185,15 +186,15 @@ def find_motions(
     sighted, covariances, fits, translations, turns, variances, windows = zip(*rows, strict=True) if rows else ((),) * 7
     return Motions(
         np.reshape(sighted, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), np.reshape(translations, (-1, 2)),
-        np.array(turns, np.float64), np.reshape(variances, (-1, 2)), np.array(fits, np.float64),
+        np.array(turns, np.float64), np.reshape(variances, (-1, 2)), np.concatenate([np.empty(0), *fits]),
         np.reshape(np.array(windows, np.int64), (-1, 2)),
     )  # fmt: skip
 
 
 def sighted_motion(
     before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray], pairs: IntArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return the motion (3,) that fits the points of two frames, its covariance, and the median squared residual."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the motion (3,) that fits the points of two frames, its covariance, and the squared residuals (n,)."""
     table = np.empty((len(pairs), COLUMNS))
     for frame, (points, covariances), rows in zip((0, 1), (before, after), pairs.T, strict=True):
         table[:, 3 * frame : 3 * frame + 3] = points[rows]
@@ -204,7 +205,7 @@ def sighted_motion(
     covariance = np.linalg.pinv(information(table, every, motion, MIN_VARIANCE)[0], hermitian=True)
     distances = squared_distances(table, motion, MIN_VARIANCE)
     freedom = 1.0 - 3.0 / (2.0 * len(pairs))  # the fit of three numbers takes its share of the residuals
-    return motion, np.asarray(covariance, np.float64), float(np.median(distances)) / (freedom * CHI_SQUARE_2)
+    return motion, np.asarray(covariance, np.float64), distances / (freedom * CHI_SQUARE_2)
 
 
 def match(
