@@ -301,6 +301,7 @@ STUDY = Study(
     chart=Chart(
         x="angle", label="viewing angle [°]", by="descriptor",
         where=lambda row: row["style"] == "distinct" and row["window"] is None and row["ratio"] == 1.0,
+        words={"descriptor": ("descriptor", {"usurf": "u-SURF", "sift": "SIFT", "orb": "ORB"}.__getitem__)},
         panels=(Panel(column=RECALL, limits=(0.0, 1.02)), Panel(column=PRECISION, limits=(0.0, 1.02))),
     ),
 )  # fmt: skip

@@ -226,6 +226,7 @@ class Chart:
         where: Test of the rows that count.
         factor: Factor of the values of `x`.
         log: Whether the x axis is logarithmic.
+        words: Headings of fields, and texts of their values.
     """
 
     x: str
@@ -237,6 +238,7 @@ class Chart:
     where: Callable[[Row], bool] = lambda row: True
     factor: float = 1.0
     log: bool = False
+    words: Words = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,6 +9,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.transforms import ScaledTranslation
 
 from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.statistics import grouped
@@ -19,6 +20,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7
 MARKERS = "osD^vxP"
 WIDTH = 45  # of a title [letters]
 STYLES = "-", "--", ":", "-."
+APART = 2.2  # distance between the points of two lines at the same x, so that their intervals do not overlap [pt]
 
 
 @picture
@@ -51,7 +53,8 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
         for ax in axes[len(drawn) :]:
             ax.set_visible(False)
         if chart.by:
-            add_legend(figure, axes[0], title=in_words(chart.by)[0])
+            title = chart.words[chart.by][0] if chart.by in chart.words else in_words(chart.by)[0]
+            add_legend(figure, axes[0], title=title)
         save_png(figure, file, 110)
 
 
@@ -60,22 +63,25 @@ def draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names:
     column = panel.column
     for place, name in enumerate(names):
         of_name = [row for row in rows if not chart.by or row[chart.by] == name]
-        colour = COLOURS[place % len(COLOURS)]
+        colour, text = COLOURS[place % len(COLOURS)], value_text(chart.words, chart.by, name)
         if of_name and all(row[chart.x] is None for row in of_name):
             level = column.estimate(of_name).value
             if level is not None:
-                ax.axhline(level, lw=1.2, ls="--", color=colour, label=str(name))
+                ax.axhline(level, lw=1.2, ls="--", color=colour, label=text)
             continue
         groups = sorted(grouped(of_name, (chart.x,)).items())
         found = [(chart.factor * x, column.estimate(group)) for (x,), group in groups]
         known = [(x, estimate) for x, estimate in found if estimate.value is not None]
         xs, values = [x for x, _ in known], [estimate.value for _, estimate in known]
-        ax.plot(
-            xs, values, marker=MARKERS[place % len(MARKERS)], ms=5, mfc="none", lw=1.2, color=colour, label=str(name)
+        aside = (place - 0.5 * (len(names) - 1)) * APART / 72.0
+        drawn = ax.plot(
+            xs, values, marker=MARKERS[place % len(MARKERS)], ms=5, mfc="none", lw=1.2, color=colour, label=text
         )
         for x, estimate in known:
             if estimate.low is not None and estimate.high is not None:
-                ax.plot([x, x], [estimate.low, estimate.high], color=colour, lw=0.8)
+                drawn += ax.plot([x, x], [estimate.low, estimate.high], color=colour, lw=0.8)
+        for line in drawn if len(drawn) > 1 else ():  # after the limits of the axes include them
+            line.set_transform(ax.transData + ScaledTranslation(aside, 0.0, ax.figure.dpi_scale_trans))
     if chart.log:
         ax.set_xscale("log")
         ax.set_xticks(sorted({chart.factor * row[chart.x] for row in rows if row[chart.x] is not None}))

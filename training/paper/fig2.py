@@ -1,6 +1,7 @@
 """Fig. 2 of the paper: errors of alignment methods over the size of the two maps."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,13 +10,15 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, align_maps, propose_motion
-from training.experiments.study import Chart, Claim, Column, Estimate, Panel, ResultTable, Row, Study
+from training.experiments.study import Chart, Claim, Column, Estimate, Panel, ResultTable, Row, Study, Words
 from training.paper.config import Fig2Config, Fig2Trial
 from training.paper.map_pairs import map_alone, simulate_pair, true_motion
 
 PAPER_METHODS = ("svd", "icp", "impicp", "ransac")
 OURS = "ours"  # ransac with refinement and refusals
 METHODS = (*PAPER_METHODS, OURS)
+NAMES = {"svd": "SVD", "icp": "ICP", "impicp": "ImpICP", "ransac": "RANSAC", OURS: "ours (refined)"}
+WORDS: Words = {"method": ("method", NAMES.__getitem__)}
 ENOUGH_SHARED = 12  # shared landmarks below which maps need not be alignable
 BIN = 50  # width of a bin [landmarks]
 # Thresholds of "practically zero", for medians over the runs in each bin.
@@ -54,17 +57,21 @@ def _error(motion: FloatArray | None, truth: FloatArray) -> dict[str, float] | N
 
 
 def unfold(rows: Sequence[Row]) -> list[Row]:
-    """Return a row for each stage and method: errors, None without an alignment, and `size`, the middle of a bin."""
-    return [
+    """Return a row for each stage and method: errors, None without an alignment, and `size`, the middle of a bin.
+
+    Smaller maps come first.
+    """
+    found = [
         {
             "seed": row["seed"], "length_m": stage["length"], "landmarks": stage["size"],
-            "size": (stage["size"] // BIN + 0.5) * BIN, "shared": stage["shared"], "method": method,
+            "size": int((stage["size"] // BIN + 0.5) * BIN), "shared": stage["shared"], "method": method,
             "found": stage[method] is not None, **(stage[method] or dict.fromkeys(PRACTICALLY_ZERO)),
         }
         for row in rows
         for stage in row["stages"]
         for method in METHODS
     ]  # fmt: skip
+    return sorted(found, key=lambda row: int(row["size"]))
 
 
 def _spread(name: str, rows: Sequence[Row]) -> Estimate:
@@ -140,6 +147,9 @@ STUDY = Study(
     ),
     chart=Chart(
         x="size", label="landmarks in a map", by="method", where=_share_enough,
-        panels=tuple(Panel(column=column, log=True) for column in MEDIANS),
+        words=WORDS,
+        panels=tuple(
+            Panel(column=replace(column, heading=f"error of {column.title}"), log=True) for column in MEDIANS
+        ),
     ),
 )  # fmt: skip
