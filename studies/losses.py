@@ -381,9 +381,10 @@ STUDY = Study(
         ),
     ),
     curves=Curves(
-        by=("condition",),
-        columns=tuple(
-            Column(name, f"{name} [m]".replace("_", " ")) for name in ("odometry", "batch", "ideal_online", "filter")
+        by=("condition",), label="position RMS over robots [m]",
+        columns=(
+            Column("odometry", "odometry"), Column("filter", "filter"), Column("ideal_online", "ideal online"),
+            Column("batch", "batch ML"),
         ),
     ),
 )  # fmt: skip

@@ -76,6 +76,10 @@ def ellipse_95(mean: FloatArray, covariance: FloatArray, **style: Any) -> Ellips
 
 
 def add_legend(figure: Figure, axes: Axes, **style: Any) -> None:
-    """Add a legend for the content of some axes above a figure, in one row."""
+    """Add a legend for the content of some axes above a figure, in as few rows as fit into its width."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, **style)
+    for columns in range(len(labels), 0, -1):
+        legend = figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, **style)
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return
+        legend.remove()

@@ -250,12 +250,15 @@ class Curves:
         columns: Names of the curves, with headings and factors; each has a panel.
         rows: The first of these fields, with a row of panels for each combination of their values.
         words: Headings of fields, and texts of their values.
+        label: Label of a logarithmic axis that all curves share, in a panel for each combination; empty: each curve has
+            its own panels.
     """
 
     by: tuple[str, ...]
     columns: tuple[Column, ...]
     rows: tuple[str, ...] = ()
     words: Words = field(default_factory=dict)
+    label: str = ""
 
     def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
         """Return a line for each group and time: the fields, `time_s`, and means with the ends of their intervals.

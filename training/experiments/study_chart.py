@@ -18,7 +18,9 @@ from training.experiments.tables import in_words
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for the colour-blind
 MARKERS = "osD^vxP"
-WIDTH = 45  # of a title [letters]
+MOST_TICKS = 6  # of a logarithmic axis; above, labels would overlap, and powers of ten are labelled
+MOST_COLUMNS = 3  # of panels with shared curves
+WIDTH = 38  # of a title [letters]
 STYLES = "-", "--", ":", "-."
 APART = 2.2  # distance between the points of two lines at the same x, so that their intervals do not overlap [pt]
 
@@ -52,6 +54,13 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
                 ax.tick_params(labelbottom=True)
         for ax in axes[len(drawn) :]:
             ax.set_visible(False)
+        if chart.log:  # of all panels, which share it
+            axes[0].set_xscale("log")
+            ticks = sorted({chart.factor * row[chart.x] for row in chosen if row[chart.x] is not None})
+            if len(ticks) <= MOST_TICKS:
+                axes[0].set_xticks(ticks)
+            axes[0].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes[0].xaxis.set_minor_locator(NullLocator())
         if chart.by:
             title = chart.words[chart.by][0] if chart.by in chart.words else in_words(chart.by)[0]
             add_legend(figure, axes[0], title=title)
@@ -82,11 +91,6 @@ def draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names:
                 drawn += ax.plot([x, x], [estimate.low, estimate.high], color=colour, lw=0.8)
         for line in drawn if len(drawn) > 1 else ():  # after the limits of the axes include them
             line.set_transform(ax.transData + ScaledTranslation(aside, 0.0, ax.figure.dpi_scale_trans))
-    if chart.log:
-        ax.set_xscale("log")
-        ax.set_xticks(sorted({chart.factor * row[chart.x] for row in rows if row[chart.x] is not None}))
-        ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        ax.xaxis.set_minor_locator(NullLocator())
     if panel.log:
         ax.set_yscale("log")
         bottom, top = ax.get_ylim()
@@ -104,39 +108,64 @@ def draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names:
 
 @picture
 def draw_curves(file: Path, curves: Curves, rows: Sequence[Row]) -> None:
-    """Draw means over time into a PNG file, a panel for each curve; nothing without rows."""
+    """Draw means over time into a PNG file, a panel for each curve or combination; nothing without rows."""
     lines = curves.lines(rows)
     if not lines:
         return
+    if curves.label:
+        _draw_shared(file, curves, lines)
+        return
     facets = grouped(lines, curves.rows)
-    keys = list(grouped(lines, curves.by[len(curves.rows) :]))
+    names = [name for name in curves.by[len(curves.rows) :] if len(grouped(lines, (name,))) > 1] or curves.by[-1:]
+    keys = list(grouped(lines, names))
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
         size = 3.1 * len(curves.columns), 2.7 * len(facets) + 0.4
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(len(facets), len(curves.columns), squeeze=False, sharex=True)
         for panels, (place, facet) in zip(axes, facets.items(), strict=True):
             for ax, column in zip(panels, curves.columns, strict=True):
-                for key, group in grouped(facet, curves.by[len(curves.rows) :]).items():
-                    _draw_curve(ax, curves, column, key, keys.index(key), group)
+                for key, group in grouped(facet, names).items():
+                    _draw_curve(ax, column, _label(curves, names, key), keys.index(key), group)
                 ax.set_ylabel(column.title)
                 ax.grid(alpha=0.2)
             panels[0].set_title(_label(curves, curves.rows, place), loc="left")
         for ax in axes[-1]:
             ax.set_xlabel("time [s]")
-        title = ", ".join(in_words(name)[0] for name in curves.by[len(curves.rows) :])
-        add_legend(figure, axes[0][0], title=title)
+        add_legend(figure, axes[0][0], title=", ".join(in_words(name)[0] for name in names))
         save_png(figure, file, 110)
 
 
-def _draw_curve(ax: Axes, curves: Curves, column: Column, key: Any, place: int, group: Sequence[Row]) -> None:
+def _draw_shared(file: Path, curves: Curves, lines: Sequence[Row]) -> None:
+    """Draw all curves of each combination into one panel, without the first time, at which errors are zero."""
+    panels = grouped([line for line in lines if line["time_s"] > 0.0], curves.by)
+    columns = min(len(panels), MOST_COLUMNS)
+    count = -(-len(panels) // columns)
+    with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
+        figure = Figure(figsize=(3.1 * max(columns, 2), 2.7 * count + 0.4), layout="constrained")
+        axes = figure.subplots(count, columns, squeeze=False, sharex=True, sharey=True).ravel()
+        for place, (ax, (key, group)) in enumerate(zip(axes, panels.items(), strict=False)):
+            for line, column in enumerate(curves.columns):
+                _draw_curve(ax, column, column.title, line, group)
+            ax.set_yscale("log")
+            ax.set_title(fill(_label(curves, curves.by, key), WIDTH), loc="left")
+            ax.grid(alpha=0.2)
+            if place % columns == 0:
+                ax.set_ylabel(curves.label)
+            if place + columns >= len(panels):
+                ax.set_xlabel("time [s]")
+                ax.tick_params(labelbottom=True)
+        for ax in axes[len(panels) :]:
+            ax.set_visible(False)
+        add_legend(figure, axes[0])
+        save_png(figure, file, 110)
+
+
+def _draw_curve(ax: Axes, column: Column, label: str, place: int, group: Sequence[Row]) -> None:
     """Draw the mean of a group over time with its interval."""
     known = [line for line in group if line[column.name] is not None]
     times, style = [line["time_s"] for line in known], STYLES[place // len(COLOURS) % len(STYLES)]
     colour, factor = COLOURS[place % len(COLOURS)], column.scale
-    ax.plot(
-        times, [factor * line[column.name] for line in known], lw=1.2, color=colour, ls=style,
-        label=_label(curves, curves.by[len(curves.rows) :], key),
-    )  # fmt: skip
+    ax.plot(times, [factor * line[column.name] for line in known], lw=1.2, color=colour, ls=style, label=label)
     if known and known[0][f"{column.name}_low"] is not None:
         low, high = ([factor * line[f"{column.name}_{end}"] for line in known] for end in ("low", "high"))
         ax.fill_between(times, low, high, color=colour, alpha=0.12, lw=0)

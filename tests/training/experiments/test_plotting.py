@@ -9,8 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from training.experiments import study_chart
-from training.experiments.plotting import save_png
-from training.experiments.study import Chart, Column, Panel
+from training.experiments.plotting import add_legend, save_png
+from training.experiments.study import Chart, Column, Curves, Panel
 
 
 def _figure() -> Figure:
@@ -57,3 +57,32 @@ def test_panels_without_values_leave_no_gaps(tmp_path: Path, monkeypatch: pytest
     shown = [ax for ax in drawn[0].axes if ax.get_visible()]
     assert [ax.get_ylabel() for ax in shown] == ["u", "v", "u", "u"]
     assert [ax.get_title(loc="left") for ax in shown] == ["a", "", "b", "c"]
+
+
+def test_a_legend_fits_into_the_width_of_its_figure() -> None:
+    """A legend with long texts has as many rows as it takes, and one with short texts has one."""
+    for text, columns in (("a", 6), ("policy " * 3, 2)):
+        figure = Figure(figsize=(6.0, 4.0), layout="constrained")
+        axes = figure.subplots()
+        for place in range(6):
+            axes.plot([0, 1], label=f"{text} {place}")
+        add_legend(figure, axes)
+        (legend,) = figure.legends
+        figure.draw_without_rendering()
+        assert legend.get_window_extent().width <= figure.bbox.width
+        assert len({round(text.get_window_extent().x0) for text in legend.get_texts()}) == columns
+
+
+def test_curves_with_a_common_label_share_a_panel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each combination has a panel with a line for each curve, without the first time, at which errors are zero."""
+    drawn: list[Figure] = []
+    monkeypatch.setattr(study_chart, "save_png", lambda figure, file, dpi: drawn.append(figure))
+    rows = [{"k": k, "curves": {"time_s": [0.0, 1.0, 2.0], "u": [0.0, 1.0, 2.0], "v": [0.0, 3.0, 4.0]}} for k in "abcd"]
+    curves = Curves(by=("k",), columns=(Column("u"), Column("v")), label="error [m]")
+    study_chart.draw_curves(tmp_path / "curves.png", curves, rows)
+    shown = [ax for ax in drawn[0].axes if ax.get_visible()]
+    assert [ax.get_title(loc="left") for ax in shown] == list("abcd")
+    assert [[np.asarray(line.get_ydata()).tolist() for line in ax.lines] for ax in shown] == [
+        [[1.0, 2.0], [3.0, 4.0]]
+    ] * 4
+    assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["u", "v"]
