@@ -20,7 +20,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7
 MARKERS = "osD^vxP"
 MOST_TICKS = 6  # of a logarithmic axis; above, labels would overlap, and powers of ten are labelled
 MOST_COLUMNS = 3  # of panels with shared curves
-WIDTH = 38  # of a title [letters]
+WIDTH = 36  # of a title [letters]
 STYLES = "-", "--", ":", "-."
 APART = 2.2  # distance between the points of two lines at the same x, so that their intervals do not overlap [pt]
 
