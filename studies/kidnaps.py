@@ -74,7 +74,7 @@ class Drive(NamedTuple):
     frames: Sequence[Measurements | None]
     true_ids: Sequence[IntArray]  # Negative: of no landmark
     true_path: FloatArray  # (T, 3) float64 [m, m, rad]; NaN where it is unknown
-    options: dict[str, Any]  # Of the filter
+    options: dict[str, Any]  # Options of the filter
 
     def without(self, begin: int, end: int) -> "Drive":
         """Return the drive without some steps, as if the robot had been carried."""

@@ -221,7 +221,7 @@ class Relocalisation:
 
     Attributes:
         robot: Index of the robot.
-        shift: Where it was, minus where it was believed to be [m, m, rad], map frame.
+        shift: Difference [m, m, rad] of its pose to the one that was believed, map frame.
         num_landmarks: Number of landmarks that were held twice and are now one.
         was_lost: Whether the covariance that was claimed for its pose excludes the shift. False: a late loop closure.
     """

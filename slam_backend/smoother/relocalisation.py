@@ -36,7 +36,7 @@ class Relocated(NamedTuple):
 
     Attributes:
         robot: Index of the robot.
-        shift: (3,) float64 [m, m, rad], map frame. Where it is, minus where it was believed to be.
+        shift: (3,) float64 [m, m, rad], map frame. Difference of its newest pose to the one that was believed.
         distance_sq: Squared Mahalanobis distance [-] of the shift, by the claimed covariance.
         pairs: (n, 2) int64 rows (id of the later landmark, id of the older one).
         graph: Graph with the moved path and without the later landmarks, before the next descent.

@@ -43,7 +43,7 @@ def test_scales_are_measured(scale: float, seed: int) -> None:
 
 
 @pytest.mark.parametrize("late", [-4, -2, 3])
-def test_delays_of_the_odometry_are_told_in_steps(late: int) -> None:
+def test_a_delay_of_the_odometry_is_named_in_steps(late: int) -> None:
     """Where turns change, odometry that is some steps late or early is named, with the number of steps."""
     rng, log = np.random.default_rng(late + 10), circle_log("none", 1)
     turns = np.where(np.arange(len(log.odometry)) // 15 % 2, 0.15, -0.05)
