@@ -77,10 +77,10 @@ CAUSES = {  # what is said of each cause; `{ratio}` is what was found
     "length, and the track of the wheels.",
     "delay": "The odometry's turns come {ratio:.0f} steps after those of the sightings (before them if negative): "
     "check the time stamps.",
-    "measurement noise": "Points differ by {ratio:.0f} times the assumed noise: assume more measurement noise, or check"
-    " the association of the measurements.",
-    "odometry noise": "Motions differ by {ratio:.0f} times the assumed noise: assume more odometry noise, or check the "
-    "time stamps.",
+    "measurement noise": "Points differ by {ratio:.0f} times their assumed standard deviation: assume more measurement "
+    "noise, or check the association of the measurements.",
+    "odometry noise": "Motions differ by {ratio:.0f} times their assumed standard deviation: assume more odometry "
+    "noise, or check the time stamps.",
 }
 
 

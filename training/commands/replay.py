@@ -157,10 +157,10 @@ def _replay(call: Call[Any], config: ReplayConfig, reader: "Callable[..., Log]")
     lines = log.source.complete(metrics, result, scores[0])
     shown = plain(metrics)
     call.write(shown)
+    for cause in shown["set_up"]:  # first, as all else may follow from it
+        print_warning(f"robot {cause['robot']}, {cause['cause']}: {cause['text']}", console)
     print_tables(console, shown)
     print_consistency(console, shown["consistency"])
-    for cause in shown["set_up"]:
-        print_warning(f"robot {cause['robot']}, {cause['cause']}: {cause['text']}", console)
     names = {group: "-".join(str(log.robots[robot].number) for robot in group) for group in result.groups}
     lines += [*_summary(shown), f"Filter time: {result.seconds:.1f} s, {result.speed:.0f} times real time."]
     for line in [*lines, write_maps(folder, {name: result.maps[group[0]] for group, name in names.items()})]:
