@@ -3,8 +3,9 @@
 Landmarks of one robot that look like older ones that it saw elsewhere are aligned with these, as two maps of unknown
 relative frame are. Where the alignment holds, the robot's path since then is moved, both landmarks of a pair become
 one, and the smoother continues from there. A motion that the claimed covariance of the robot's pose allows is a late
-loop closure: odometry and its noise stay as they are. Otherwise the robot was lost: the odometry is cut where fewest
-landmarks were seen on both sides.
+loop closure: odometry and its noise stay as they are. Otherwise the robot was lost if there is a moment at which its
+view stayed the same while the odometry jumped: there the odometry is cut. Without such a moment the other place may be
+another one that looks alike, as a second corridor does, and nothing is done.
 
 Landmarks that only other robots saw do not count: where these disagree, the start of the robot may be wrong and not its
 odometry, and a merge is to be undone.
@@ -28,6 +29,7 @@ from slam_backend.smoother.optimizer import MapEstimate
 from slam_backend.smoother.reassociation import LandmarkTable
 
 MIN_PAIRS = 5  # landmarks seen again
+SAME_VIEW, VIEW = 3, 10  # landmarks in the last and in the next so many keys that tell a jump of the odometry
 LOST = 16.27  # squared Mahalanobis distance of the motion beyond which the pose was wrong, 99.9 % of 3 degrees
 
 
@@ -146,24 +148,23 @@ def _moved(
     row = {int(name): i for i, name in enumerate(graph.landmark_ids)}
     new, old = (np.array([row[int(name)] for name in names]) for names in pairs.T)
     keys = np.flatnonzero((graph.robots == robot) & (mode.columns >= 0))
-    begin = int(seen.first[new].min())
-    end = int(seen.last[old][seen.last[old] < begin].max(initial=UNSEEN))
     newest = graph.last_keys[robot]
     shift, distance_sq = _shift(found, graph.poses[newest], mode.covariance(np.array([newest])))
-    between_parts = keys[(keys > end) & (keys <= begin)]
-    if not len(between_parts):
-        return None
-    shares = np.zeros(graph.num_keys)
-    shares[keys[keys > begin]] = 1.0
     noises, variances = graph.odometry_covariances, graph.transition_variances
+    shares = np.zeros(graph.num_keys)
     if distance_sq > LOST:
-        bridging = [np.count_nonzero((seen.first >= 0) & (seen.first < at) & (seen.last >= at)) for at in between_parts]
-        cut = int(between_parts[len(bridging) - 1 - int(np.argmin(bridging[::-1]))])  # the last of equal ones
+        cut = _cut(keys, seen.last[old], seen.first[new])
+        if cut is None:
+            return None
         shares[keys[keys >= cut]] = 1.0
         noises, variances = noises.copy(), variances.copy()
         noises[cut], variances[cut] = np.diag(UNINFORMATIVE), UNINFORMATIVE[0]
     else:
-        shares[between_parts] = np.arange(1, len(between_parts) + 1) / len(between_parts)
+        begin = int(seen.first[new].min())
+        end = int(seen.last[old][seen.last[old] < begin].max(initial=UNSEEN))
+        shares[keys[keys > begin]] = 1.0
+        way = keys[(keys > end) & (keys <= begin)]
+        shares[way] = np.arange(1, len(way) + 1) / max(len(way), 1)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     for key in np.flatnonzero(shares):
         poses[key] = compose(shares[key] * found.transform, poses[key])
@@ -178,6 +179,20 @@ def _moved(
         pairs,
     )
     return Relocated(robot, shift, distance_sq, pairs, without_unused_frames(joined))
+
+
+def _cut(keys: IntArray, last: IntArray, first: IntArray) -> int | None:
+    """Return the key at which the view stayed the same while the odometry jumped; None if none is clear.
+
+    Args:
+        keys: (k,) keys of the robot.
+        last, first: (n,) last key from which each older landmark was seen, and first from which the later one was.
+    """
+    before, after = np.searchsorted(keys, last), np.searchsorted(keys, first)
+    places = np.arange(len(keys))[:, None]
+    same = (before < places) & (before >= places - VIEW) & (after >= places) & (after < places + VIEW)
+    counts = same.sum(axis=1)
+    return int(keys[counts.argmax()]) if counts.max(initial=0) >= SAME_VIEW else None
 
 
 def _shift(found: Alignment, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
