@@ -6,7 +6,7 @@ python -m studies.kidnaps --seeds 20
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,9 @@ from training.replay.readers import read_mrclam
 from vslam_env import preset_config, vslam_v1
 
 World = Literal["circle", "office", "mrclam"]
+Event = Literal["jump", "carried", "none"]
 JUMP = np.array([3.0, 2.0, 1.0])  # [m, m, rad] by which one odometry reading is wrong
-CUT = 100.0  # [s] of a log that are left out
+CUT = {"circle": 30, "office": 150, "mrclam": 400}  # steps of a drive that are left out
 KNOWN = 5  # landmarks seen again after which a robot could know
 IN_TIME = 50  # steps within which it should
 
@@ -53,17 +54,17 @@ class Trial:
     """One robot."""
 
     world: World
-    kidnapped: bool  # Whether the robot is carried off
+    event: Event  # One wrong reading of the odometry, a part of the drive without readings, or neither
     seed: int  # Seed of the noise, the filter, and the time
 
 
 def trials(config: Config) -> list[Trial]:
     """Return all trials."""
     return [
-        Trial(world=world, kidnapped=kidnapped, seed=seed)
+        Trial(world=world, event=event, seed=seed)
         for world in config.worlds
         for seed in range(config.seed, config.seed + config.seeds)
-        for kidnapped in (True, False)
+        for event in get_args(Event)
     ]
 
 
@@ -142,11 +143,10 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     count, rng = len(own.odometry), np.random.default_rng((trial.seed, 1))
     at = int(count * rng.uniform(0.4, 0.6))
     odometry = own.odometry.copy()
-    if trial.kidnapped and trial.world == "mrclam":
-        own = own.without(at, at + int(CUT * 4))
+    if trial.event == "carried":
+        own = own.without(at, at + CUT[trial.world])
         odometry = own.odometry.copy()
-        odometry[at] = 0.0
-    elif trial.kidnapped:
+    elif trial.event == "jump":
         odometry[at] = compose(odometry[at], JUMP)
     slam = FastSlam(seed=trial.seed, **own.options)
     path, moved = np.zeros((count, 3)), []
@@ -157,13 +157,13 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
             moved.append(step)
     warnings = [one.step for one in slam.consistency.warnings if one.sign == "lost"]
     known = {int(name) for names in own.true_ids[:at] for name in names if name >= 0}
-    could = next(_known_again(own.true_ids, at, known), None) if trial.kidnapped else None
-    late = next((step for step in warnings if step >= at), None) if trial.kidnapped else None
+    could = next(_known_again(own.true_ids, at, known), None) if trial.event != "none" else None
+    late = next((step for step in warnings if step >= at), None) if trial.event != "none" else None
     off = path[: len(odometry)] - _in_start_frame(own.true_path)
     errors, apart = np.hypot(*off[:, :2].T), np.abs(wrap_angle(off[:, 2]))
     return {
         "warned": late is not None, "could": could is not None,
-        "others": len([step for step in warnings if step < at or not trial.kidnapped]),
+        "others": len([step for step in warnings if step < at or trial.event == "none"]),
         "worse": sum(bool(errors[n] + apart[n] > errors[n - 1] + apart[n - 1]) for n in moved),
         "moved": len(moved), "delay": None if could is None or late is None else late - could,
         "in_time": None if could is None else late is not None and late - could <= IN_TIME,
@@ -194,7 +194,7 @@ STUDY = Study(
     name="kidnaps",
     about="""Carry robots off, and see how soon filters notice it, and whether they find themselves again.
 
-    In the circle and in offices one odometry reading is wrong by 3 m, 2 m and 1 rad; of a real log a part is left out.
+    Either one odometry reading is wrong by 3 m, 2 m and 1 rad, or the readings of a part of the drive are left out.
     Robots that are not carried off show false alarms.
     """,
     config=Config,
@@ -204,7 +204,7 @@ STUDY = Study(
     quick={"worlds": ("circle",), "seeds": 2},
     tables=(
         ResultTable(
-            name="kidnaps", title="Robots that are carried off, and others", by=("world", "kidnapped"),
+            name="kidnaps", title="Robots that are carried off, and others", by=("world", "event"),
             columns=(
                 Column("warned", "lost [%]", digits=0, factor=100.0), Column("others", "others", "sum", digits=0),
                 Column("moved", "found", "sum", digits=0), Column("worse", "worse", "sum", digits=0),
