@@ -4,8 +4,9 @@ Landmarks of one robot that look like older ones that it saw elsewhere are align
 relative frame are. Where the alignment holds, the robot's path since then is moved, both landmarks of a pair become
 one, and the smoother continues from there. A motion that the claimed covariance of the robot's pose allows is a late
 loop closure: odometry and its noise stay as they are. Otherwise the robot was lost if there is a moment at which its
-view stayed the same while the odometry jumped, or changed while it hardly moved: there the odometry is cut. Without
-such a moment the other place may be another one that looks alike, as a second corridor does, and nothing is done.
+view stayed the same while the odometry jumped: there the odometry is cut. Without such a moment the other place may be
+another one that looks alike, as a second corridor does, and nothing is done. (A view that changes while a robot hardly
+moves is no such moment: that happens at corners.)
 
 Landmarks that only other robots saw do not count: where these disagree, the start of the robot may be wrong and not its
 odometry, and a merge is to be undone.
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import compose, rotation, wrap_angle
 from slam_backend.maps.alignment import align_maps
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
@@ -30,7 +31,6 @@ from slam_backend.smoother.reassociation import LandmarkTable
 
 MIN_PAIRS = 5  # landmarks seen again
 SAME_VIEW, VIEW = 3, 10  # landmarks in the last and in the next so many keys that tell a jump of the odometry
-HARDLY = 0.5, 0.3  # [m, rad] between two keys, over which views share landmarks
 LOST = 16.27  # squared Mahalanobis distance of the motion beyond which the pose was wrong, 99.9 % of 3 degrees
 
 
@@ -154,7 +154,7 @@ def _moved(
     noises, variances = graph.odometry_covariances, graph.transition_variances
     shares = np.zeros(graph.num_keys)
     if distance_sq > LOST:
-        cut = _cut(graph, keys, seen, old, new)
+        cut = _cut(keys, seen.last[old], seen.first[new])
         if cut is None:
             return None
         shares[keys[keys >= cut]] = 1.0
@@ -182,41 +182,18 @@ def _moved(
     return Relocated(robot, shift, distance_sq, pairs, without_unused_frames(joined))
 
 
-def _cut(graph: SlamGraph, keys: IntArray, seen: _Sightings, old: IntArray, new: IntArray) -> int | None:
-    """Return the key before which the odometry is wrong; None if the readings tell none.
-
-    Either the view stayed the same while the odometry jumped, or the view changed while the odometry says that the
-    robot hardly moved.
+def _cut(keys: IntArray, last: IntArray, first: IntArray) -> int | None:
+    """Return the key at which the view stayed the same while the odometry jumped; None if none is clear.
 
     Args:
-        graph: The graph.
         keys: (k,) keys of the robot.
-        seen: Sightings of the robot.
-        old, new: (n,) rows of older landmarks and of the later ones that are the same.
+        last, first: (n,) last key from which each older landmark was seen, and first from which the later one was.
     """
+    before, after = np.searchsorted(keys, last), np.searchsorted(keys, first)
     places = np.arange(len(keys))[:, None]
-
-    def before(last: IntArray) -> BoolArray:
-        at = np.searchsorted(keys, last)
-        return np.asarray((at < places) & (at >= places - VIEW))
-
-    def after(first: IntArray) -> BoolArray:
-        at = np.searchsorted(keys, first)
-        return np.asarray((at >= places) & (at < places + VIEW))
-
-    stayed = (before(seen.last[old]) & after(seen.first[new])).sum(axis=1)
-    if stayed.max(initial=0) >= SAME_VIEW:
-        return int(keys[stayed.argmax()])
-    own = seen.first >= 0
-    first, last = seen.first[own], seen.last[own]
-    bridged = ((first < keys[:, None]) & (last >= keys[:, None])).any(axis=1)
-    views = np.minimum(before(last).sum(axis=1), after(first).sum(axis=1))
-    moves = np.abs(graph.odometry[keys])
-    still = (np.hypot(moves[:, 0], moves[:, 1]) <= HARDLY[0]) & (moves[:, 2] <= HARDLY[1])
-    begin = seen.first[new].min()
-    end = seen.last[old][seen.last[old] < begin].max(initial=UNSEEN)
-    found = keys[still & (keys > end) & (keys <= begin) & ~bridged & (views >= SAME_VIEW)]
-    return int(found[-1]) if len(found) else None
+    same = (before < places) & (before >= places - VIEW) & (after >= places) & (after < places + VIEW)
+    counts = same.sum(axis=1)
+    return int(keys[counts.argmax()]) if counts.max(initial=0) >= SAME_VIEW else None
 
 
 def _shift(found: Alignment, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
