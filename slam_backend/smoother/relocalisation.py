@@ -30,7 +30,7 @@ from slam_backend.smoother.optimizer import MapEstimate
 from slam_backend.smoother.reassociation import LandmarkTable
 
 MIN_PAIRS = 5  # landmarks seen again
-SAME_VIEW, VIEW = 3, 10  # landmarks in the last and in the next so many keys that tell a jump of the odometry
+SAME_VIEW, VIEW = 3, 3  # landmarks in the last and in the next so many keys that tell a jump of the odometry
 LOST = 16.27  # squared Mahalanobis distance of the motion beyond which the pose was wrong, 99.9 % of 3 degrees
 
 
