@@ -135,6 +135,7 @@ def draw_curves(file: Path, curves: Curves, rows: Sequence[Row]) -> None:
         save_png(figure, file, 110)
 
 
+@picture
 def _draw_shared(file: Path, curves: Curves, lines: Sequence[Row]) -> None:
     """Draw all curves of each combination into one panel, without the first time, at which errors are zero."""
     panels = grouped([line for line in lines if line["time_s"] > 0.0], curves.by)
