@@ -1,4 +1,4 @@
-"""Robots that are carried off: how soon filters notice, and whether they find themselves again.
+"""Robots that are lost: how soon filters notice, and whether they find themselves again.
 
 python -m studies.kidnaps --seeds 20
 """
@@ -18,7 +18,7 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import compose, inverse, wrap_angle
 from slam_backend.models.measurements import Measurements
 from studies.bounds.episodes import record_episode
-from studies.mistakes import MOTION, circle_log
+from studies.mistakes import MOTION, MOVE, circle_log
 from training.bench.exploration.players import parted
 from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, first_seed, option
@@ -39,7 +39,7 @@ IN_TIME = 50  # steps within which it should
 
 
 class Config(ExperimentConfig):
-    """Robots that are carried off once, and robots that are not."""
+    """Robots whose odometry jumps once, that are carried, and others."""
 
     worlds: tuple[World, ...] = option(
         ("circle", "office", "mrclam"), "Worlds: circle (of the SLAM tutorial), office, mrclam (data set 7)."
@@ -79,11 +79,11 @@ class Drive(NamedTuple):
 
     def without(self, begin: int, end: int) -> "Drive":
         """Return the drive without some steps, as if the robot had been carried."""
-        kept = [step for step in range(len(self.odometry)) if not begin <= step < end]
-        path = self.true_path[kept]
         return Drive(
-            self.odometry[kept], [self.frames[i] for i in kept], [self.true_ids[i] for i in kept], path, self.options
-        )
+            np.delete(self.odometry, slice(begin, end), axis=0), [*self.frames[:begin], *self.frames[end:]],
+            [*self.true_ids[:begin], *self.true_ids[end:]], np.delete(self.true_path, slice(begin, end), axis=0),
+            self.options,
+        )  # fmt: skip
 
 
 @lru_cache(maxsize=2)
@@ -93,7 +93,7 @@ def drive(world: World, seed: int, preset: Literal["standard", "hard"]) -> Drive
         log = circle_log("none", seed)
         path = np.zeros((len(log.odometry), 3))
         for step in range(1, len(path)):
-            path[step] = compose(path[step - 1], np.array([0.2, 0.0, 0.05]))
+            path[step] = compose(path[step - 1], MOVE)
         return Drive(log.odometry, log.measurements, log.identities, path, {"motion": MOTION})
     if world == "office":
         player = parted("frontier@continuous")
@@ -133,7 +133,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     """Run the filter on a drive.
 
     Returns:
-        `warned`: whether a warning says that the robot was lost; `others`: number of warnings before it was carried off
+        `warned`: whether a warning says that the robot was lost; `others`: number of warnings before that
         or without; `worse`: number of relocalisations that made the error of the pose larger. `delay`: steps from the
         first sight of five known landmarks until the warning, and `in_time`: whether it is at most `IN_TIME`; None if
         five are never seen again. `before_m`, `lost_m`, `end_m`: position error before, the largest afterwards, and at
@@ -142,14 +142,13 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     own = drive(trial.world, trial.seed, config.preset)
     count, rng = len(own.odometry), np.random.default_rng((trial.seed, 1))
     at = int(count * rng.uniform(0.4, 0.6))
-    odometry = own.odometry.copy()
     if trial.event == "carried":
         own = own.without(at, at + CUT[trial.world])
-        odometry = own.odometry.copy()
-    elif trial.event == "jump":
+    odometry = own.odometry.copy()
+    if trial.event == "jump":
         odometry[at] = compose(odometry[at], JUMP)
     slam = FastSlam(seed=trial.seed, **own.options)
-    path, moved = np.zeros((count, 3)), []
+    path, moved = np.zeros_like(odometry), []
     for step in range(len(odometry)):
         report = slam.step([odometry[step]], [own.frames[step]])
         path[step] = slam.pose().mean
@@ -159,7 +158,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     known = {int(name) for names in own.true_ids[:at] for name in names if name >= 0}
     could = next(_known_again(own.true_ids, at, known), None) if trial.event != "none" else None
     late = next((step for step in warnings if step >= at), None) if trial.event != "none" else None
-    off = path[: len(odometry)] - _in_start_frame(own.true_path)
+    off = path - _in_start_frame(own.true_path)
     errors, apart = np.hypot(*off[:, :2].T), np.abs(wrap_angle(off[:, 2]))
     return {
         "warned": late is not None, "could": could is not None,
@@ -192,10 +191,10 @@ def _in_start_frame(path: FloatArray) -> FloatArray:
 
 STUDY = Study(
     name="kidnaps",
-    about="""Carry robots off, and see how soon filters notice it, and whether they find themselves again.
+    about="""Let robots lose their pose, and see how soon filters notice it, and whether they find themselves again.
 
     Either one odometry reading is wrong by 3 m, 2 m and 1 rad, or the readings of a part of the drive are left out.
-    Robots that are not carried off show false alarms.
+    Robots with neither show false alarms.
     """,
     config=Config,
     trial=Trial,
@@ -204,7 +203,7 @@ STUDY = Study(
     quick={"worlds": ("circle",), "seeds": 2},
     tables=(
         ResultTable(
-            name="kidnaps", title="Robots that are carried off, and others", by=("world", "event"),
+            name="kidnaps", title="Robots that are lost, and others", by=("world", "event"),
             columns=(
                 Column("warned", "lost [%]", digits=0, factor=100.0), Column("others", "others", "sum", digits=0),
                 Column("moved", "found", "sum", digits=0), Column("worse", "worse", "sum", digits=0),

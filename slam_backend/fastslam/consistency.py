@@ -129,8 +129,8 @@ class LostWarning:
         """Diagnosis and advice."""
         return (
             f"Lost, and found at step {self.step}: a robot saw {self.num_landmarks} landmarks again {self.distance:.1f}"
-            " m from where they were held to be; its pose and map are corrected. Check its odometry before: gaps,"
-            " slipping wheels, or a robot that was carried."
+            " m from where they were held to be; its pose and map are corrected. Check its odometry before: jumps,"
+            " gaps, or slipping wheels."
         )
 
 

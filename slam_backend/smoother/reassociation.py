@@ -45,7 +45,7 @@ class LandmarkTable(NamedTuple):
     """Landmarks of a map whose ids come from data association.
 
     Attributes:
-        ids: (l,) int64.
+        ids: (l,) int64, ascending.
         means: (l, 3) float64 [m], map frame.
         covariances: (l, 6) float64 [m^2], upper triangles by rows.
         counts: (l,) int. Number of sightings.

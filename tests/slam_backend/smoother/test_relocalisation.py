@@ -1,4 +1,4 @@
-"""Robots that are carried off: the filter finds them at older landmarks, or says nothing."""
+"""Robots whose odometry jumps: the filter finds them at older landmarks, or says nothing."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ def errors(slam: FastSlam, seed: int, at: int | None, alike: bool = False, names
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_robot_that_was_carried_off_is_found_and_its_map_is_one_again(seed: int) -> None:
+def test_a_robot_whose_odometry_jumped_is_found_and_its_map_is_one_again(seed: int) -> None:
     """One wrong reading is noticed at the second rejuvenation at the latest, reported, and repaired."""
     slam = FastSlam(motion=MOTION, seed=seed)
     off, found = errors(slam, seed, AT)
@@ -57,7 +57,7 @@ def test_a_robot_that_was_carried_off_is_found_and_its_map_is_one_again(seed: in
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_robot_that_was_not_carried_off_is_never_lost(seed: int) -> None:
+def test_a_robot_with_right_odometry_is_never_lost(seed: int) -> None:
     """Right readings give no relocalisation."""
     slam = FastSlam(motion=MOTION, seed=seed)
     off, found = errors(slam, seed, None)
