@@ -178,5 +178,5 @@ def fusions_of_merges(problem: BatchProblem, merges: Sequence[tuple[int, Sequenc
 
 
 def true_start(episode: RecordedEpisode, problem: BatchProblem) -> Estimate:
-    """Return the true paths, so that the descent finds the minimum next to the truth, and landmarks as first seen."""
-    return problem.with_first_sights(episode.own_true_paths)
+    """Return the true paths, so that the descent finds the minimum next to the truth, and landmarks as mostly seen."""
+    return problem.with_landmarks_at(episode.own_true_paths)

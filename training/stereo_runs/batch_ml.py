@@ -23,7 +23,7 @@ BAND = 5  # super-diagonals of a block-tridiagonal matrix with blocks of 3
 MAX_ITERATIONS = 100
 FIRST_DAMPING = 1e-3  # from dead reckoning
 GIVEN_DAMPING = 1e-6  # from a given initial estimate
-MAX_DAMPING = 1e12
+LEAST_DAMPING, MAX_DAMPING = 1e-9, 1e12
 LEAST_DECREASE = 1e-12  # relative decrease of the cost at convergence
 
 
@@ -98,7 +98,11 @@ def _descend(
     """
     system = _System(problem, at, problem.sights(at, metric), robust)
     for iteration in range(MAX_ITERATIONS):
-        trial = system.moved(at, *system.solve(damping))
+        try:
+            trial = system.moved(at, *system.solve(damping))
+        except np.linalg.LinAlgError:  # outliers alone: the robust kernel leaves something without information
+            damping = max(10.0 * damping, LEAST_DAMPING)
+            continue
         changed = _System(problem, trial, problem.sights(trial, metric), robust)
         if changed.cost <= system.cost:
             decrease = system.cost - changed.cost
@@ -112,7 +116,7 @@ def _descend(
         elif damping <= FIRST_DAMPING and changed.cost - system.cost <= LEAST_DECREASE * (1.0 + system.cost):
             return at, system, iteration + 1  # at the minimum: the cost rises by rounding alone
         else:
-            damping = max(10.0 * damping, 1e-9)
+            damping = max(10.0 * damping, LEAST_DAMPING)
             if damping > MAX_DAMPING:
                 break
     return at, system, iteration + 1

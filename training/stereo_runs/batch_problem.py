@@ -119,18 +119,21 @@ class BatchProblem:
         paths[:, 0] = self.starts
         for step in range(1, self.num_steps):
             paths[:, step] = compose(paths[:, step - 1], self.odometry[:, step - 1])
-        return self.with_first_sights(paths)
+        return self.with_landmarks_at(paths)
 
-    def with_first_sights(self, paths: FloatArray) -> Estimate:
-        """Return an estimate with paths (K, T, 3), and each landmark at the position of its first measurement."""
-        _, first = np.unique(self.landmarks, return_index=True)
-        poses = paths[self.robots[first], self.steps[first]]
+    def with_landmarks_at(self, paths: FloatArray) -> Estimate:
+        """Return an estimate with paths (K, T, 3), and each landmark at the middle one of its measured positions."""
+        poses = paths[self.robots, self.steps]
         if self.bases is not None:
-            poses = compose(self.bases[self.robots[first]], poses)
-        local = self.camera.robot_from_camera(self.points[first])
+            poses = compose(self.bases[self.robots], poses)
+        local = self.camera.robot_from_camera(self.points)
         planar = np.einsum("nij,nj->ni", rotation(poses[:, 2]), local[:, :2]) + poses[:, :2]
+        order = np.argsort(self.landmarks, kind="stable")
+        ends = np.cumsum(np.bincount(self.landmarks, minlength=len(self.names)))[:-1]
+        seen = np.split(np.column_stack([planar, local[:, 2]])[order], ends) if len(order) else []
+        middle = [own[np.argmin(((own - np.median(own, axis=0)) ** 2).sum(axis=1))] for own in seen]
         biases = np.zeros((len(paths), 3)) if len(self.biased) else None
-        return Estimate(paths, np.column_stack([planar, local[:, 2]]), self.bases, biases)
+        return Estimate(paths, np.array(middle).reshape(-1, 3), self.bases, biases)
 
     def sights(self, at: Estimate, metric: bool = False) -> Sights:
         """Return the residuals of all measurements.

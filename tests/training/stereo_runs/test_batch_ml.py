@@ -11,7 +11,7 @@ from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
 from slam_backend.models.measurements import Measurements
 from studies.bounds.online import ideal_online
-from training.stereo_runs.batch_ml import BatchEstimate, batch_ml
+from training.stereo_runs.batch_ml import BatchEstimate, batch_ml, most_likely
 from training.stereo_runs.batch_problem import BatchProblem, Estimate
 from training.stereo_runs.runs import FALSE_POINT, PRESETS, NoisePreset, RunSpec, StereoRun, simulate_run
 
@@ -264,3 +264,28 @@ def test_wrong_associations_behind_a_camera_do_not_stop_the_descent(run: StereoR
         assert np.abs(pose_errors(estimate.paths, run)[:, 1:]).max() > 1e-3
     np.testing.assert_allclose(found[0].paths, found[1].paths, atol=1e-5)
     assert found[0].cost == pytest.approx(found[1].cost)
+
+
+def test_a_wrong_first_measurement_does_not_lose_a_landmark(run: StereoRun, problem: BatchProblem) -> None:
+    """A landmark whose first measurement is another's stays with its later ones, and the descent converges."""
+    _, counts = np.unique(problem.landmarks, return_counts=True)
+    often = int(np.argmax(counts))
+    first = int(np.flatnonzero(problem.landmarks == often)[0])
+    far = int(np.argmax(np.linalg.norm(run.landmarks - run.landmarks[problem.names[often]], axis=1)))
+    points = problem.points.copy()
+    pose = run.true_paths[problem.robots[first], problem.steps[first]]
+    points[first] = run.spec.noise.camera.camera_from_robot(transform_points(inverse(pose), run.landmarks[[far]]))[0]
+    points[first, 2] = abs(points[first, 2])
+    changed, truth = replace(problem, points=points), Estimate(run.true_paths, run.landmarks[problem.names])
+    found, from_sights = (batch_ml(changed, start, robust=3.0) for start in (truth, None))
+    np.testing.assert_allclose(from_sights.landmarks[often], found.landmarks[often], atol=1e-6)
+    assert np.linalg.norm(found.landmarks[often] - run.landmarks[problem.names[often]]) < 0.5
+
+
+def test_landmarks_of_outliers_alone_leave_an_estimate(run: StereoRun, problem: BatchProblem) -> None:
+    """A landmark that the robust kernel leaves without information makes no step fail, nor is any other lost."""
+    at = Estimate(run.true_paths, run.landmarks[problem.names].copy())
+    at.landmarks[0] = 1e15, 1e15, 0.0
+    found = most_likely(problem, at, robust=3.0)
+    assert np.isfinite(found.paths).all()
+    assert np.abs(pose_errors(found.paths, run)[..., :2]).max() < 0.5
