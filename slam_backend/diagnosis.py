@@ -5,7 +5,7 @@ their points. Over short windows of a log the ratios of both motions are the sam
 axes are right, and equal to one; a mistake in the set-up changes them in a way of its own.
 
 No filter is needed, and none can be misled: matches are those of given identities, or of descriptors that are nearest
-to each other in both frames.
+to each other in both frames. Of a filter that ran already, matches are those that it found.
 """
 
 import math
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.packed_symmetric import OF_NINE
+from slam_backend.core.packed_symmetric import OF_NINE, UNPACK_INDEX
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.geometry import rotation
 from slam_backend.maps.match_table import COLUMNS, planar_points, planar_variances
@@ -24,6 +24,7 @@ from slam_backend.metrics import align_se2
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother.log_arrays import EXACT, LogArrays
 
 WINDOW = 10  # longest window [steps]
 LEAST_WINDOWS = 20  # fewest windows for a diagnosis
@@ -138,6 +139,24 @@ def diagnose(
         return ()
     late = find_delay(odometry[:, 2], found)
     return (_cause("delay", late),) if late else name_causes(found)
+
+
+def diagnose_run(log: LogArrays, camera: StereoCamera, motion: OdometryModel) -> tuple[Cause, ...]:
+    """Return the likely mistakes in the set-up of a filter's log of one robot, see `diagnose`; none of exact poses."""
+    if not len(log) or (log.kinds == EXACT).any():
+        return ()
+    odometry = np.zeros((int(log.steps[-1]) + 1, 3))
+    odometry[log.steps] = log.motions
+    frames: list[Measurements | None] = [None] * len(odometry)
+    names: list[IntArray | None] = [None] * len(odometry)
+    for row in np.flatnonzero(np.diff(log.starts)).tolist():
+        step, own = int(log.steps[row]), slice(log.starts[row], log.starts[row + 1])
+        spreads = None
+        if log.covariances is not None and log.given[row]:
+            spreads = ROBOT_FROM_CAMERA.T @ log.covariances[own][:, UNPACK_INDEX] @ ROBOT_FROM_CAMERA
+        points = log.points[own] @ ROBOT_FROM_CAMERA
+        frames[step], names[step] = Measurements(points, np.zeros((len(points), 1), np.float32), spreads), log.ids[own]
+    return diagnose(odometry, frames, names, camera, motion)
 
 
 def find_delay(turns: FloatArray, found: Motions) -> int:

@@ -19,7 +19,7 @@ This is the recursion of Shiryaev and Roberts [2] with a prior over the frame at
 weak and lasting or strong and short: for each sign S is averaged over its questions and two values of p1. A
 conservative filter, for example one that assumes twice the true noise, shows no sign and raises no alarm.
 
-A robot that was lost and found again (`slam_backend.smoother.relocalisation`) is a warning of its own.
+A robot that is or was lost (`slam_backend.smoother.relocalisation`) is a warning of its own.
 
 1. A. Ramdas, P. Gruenwald, V. Vovk, G. Shafer: Game-theoretic statistics and safe anytime-valid inference. Statistical
    Science 38(4), 2023.
@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from slam_backend.fastslam.reports import Relocalisation
-from slam_backend.state import Each, Float, Int, Record, Sizes, State
+from slam_backend.state import Each, Flag, Float, Int, Record, Sizes, State
 
 FALSE_ALARM_RATE = 0.01  # largest share of consistent filters that ever raise a warning, all signs together
 NIS_BOUNDS = (7.81, 11.34)  # 95 and 99 % of chi-square with three degrees of freedom; conservative with two
@@ -58,13 +58,14 @@ CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large,
 OVER_CONFIDENT = 4.0  # mean NIS, ideally 3, above which covariances are at least a quarter too small, even in space
 VERDICTS = {  # words for a filter, with their conditions; the first one that holds applies
     "inconsistent": "a warning, other than of a lost robot",
+    "perhaps lost": "a robot sees landmarks of another place of its map, and was not found since",
     "lost and found": "a robot was lost and found again",
     "unknown": "no measurement has matched a landmark",
     "over-confident": f"mean NIS above {OVER_CONFIDENT:g}",
     "cautious": f"mean NIS below {CAUTIOUS:g}",
     "consistent": f"mean NIS from {CAUTIOUS:g} to {OVER_CONFIDENT:g}",
 }
-SET_UP = "First check units, signs and time stamps (`slam_backend.diagnosis.diagnose` names likely mistakes)"
+SET_UP = "First check units, signs and time stamps (the filter's `diagnose()` names likely mistakes)"
 ADVICE = {  # diagnosis and advice by sign
     "nis": (
         "the innovations exceed their predicted covariances, the filter is over-confident",
@@ -105,19 +106,21 @@ class ConsistencyWarning:
 
 @dataclass(frozen=True, slots=True)
 class LostWarning:
-    """A robot that held a wrong pose, until it was found at older landmarks of its map.
+    """A robot that holds or held a wrong pose.
 
     Attributes:
-        step: Step at which it was found.
-        distance: Distance [m] between where it was believed to be and where it was.
-        num_landmarks: Number of landmarks that it had built a second time, now one again.
+        step: Step at which that was noticed.
+        distance: Distance [m] between where it was believed to be and where older landmarks of its map are seen.
+        num_landmarks: Number of landmarks that it had built a second time.
+        found: Whether its pose and map were corrected; otherwise another place may look alike.
     """
 
-    STATE = State(step=Int(), distance=Float(0.0), num_landmarks=Int(1))
+    STATE = State(step=Int(), distance=Float(0.0), num_landmarks=Int(1), found=Flag())
 
     step: int
     distance: float
     num_landmarks: int
+    found: bool
 
     @property
     def sign(self) -> str:
@@ -127,10 +130,12 @@ class LostWarning:
     @property
     def text(self) -> str:
         """Diagnosis and advice."""
+        what = "Lost, and found" if self.found else "Perhaps lost"
         return (
-            f"Lost, and found at step {self.step}: a robot saw {self.num_landmarks} landmarks again {self.distance:.1f}"
-            " m from where they were held to be; its pose and map are corrected. Check its odometry before: jumps,"
-            " gaps, or slipping wheels."
+            f"{what} at step {self.step}: a robot saw {self.num_landmarks} landmarks again {self.distance:.1f} m from "
+            "where they were held to be; "
+            + ("its pose and map are corrected." if self.found else "or another place looks alike. Nothing is changed.")
+            + " Check its odometry before: jumps, gaps, slipping wheels, or a robot that was carried."
         )
 
 
@@ -146,7 +151,7 @@ class Consistency:
         ess_share: Share of the frames with an effective sample size below a tenth of the particles [-].
         rejected_share: Share of the frames with most measurements rejected [-].
         warnings: One warning for each sign with enough evidence, in the order of `SIGNS`, and one for each time that a
-            robot was lost and found.
+            robot was lost or seemed to be.
     """
 
     frames: int
@@ -159,9 +164,10 @@ class Consistency:
     @property
     def verdict(self) -> str:
         """Key of `VERDICTS`."""
+        lost = [one for one in self.warnings if isinstance(one, LostWarning)]
         conditions = (
-            any(one.sign != "lost" for one in self.warnings), bool(self.warnings), math.isnan(self.nis_mean),
-            self.nis_mean > OVER_CONFIDENT, self.nis_mean < CAUTIOUS, True,
+            any(one.sign != "lost" for one in self.warnings), any(not one.found for one in lost[-1:]), bool(lost),
+            math.isnan(self.nis_mean), self.nis_mean > OVER_CONFIDENT, self.nis_mean < CAUTIOUS, True,
         )  # fmt: skip
         return next(word for word, holds in zip(VERDICTS, conditions, strict=True) if holds)
 
@@ -233,9 +239,9 @@ class ConsistencyTest:
             self._quiet += 1
 
     def add_relocalisation(self, step: int, found: Relocalisation) -> None:
-        """Add a robot that was found at older landmarks in a step of the filter."""
-        if found.was_lost:
-            self._lost.append(LostWarning(step, found.distance, found.num_landmarks))
+        """Add a robot that saw older landmarks elsewhere in a step of the filter; lasting suspicions count once."""
+        if found.outcome == "found" or (found.outcome == "suspected" and all(one.found for one in self._lost[-1:])):
+            self._lost.append(LostWarning(step, found.distance, found.num_landmarks, found.outcome == "found"))
 
     def _restart(self) -> None:
         """Start a new product, to detect a filter that fails from here on."""

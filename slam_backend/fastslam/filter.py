@@ -25,6 +25,7 @@ from slam_backend.core.validation import (
     known_names,
     with_fields_of,
 )
+from slam_backend.diagnosis import Cause, diagnose_run
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, add_gauge_covariance
 from slam_backend.fastslam._kernels.records import ROBOT, WEIGHT, StepSummary
@@ -520,7 +521,7 @@ class FastSlam:
         found = None
         if (moved := result.relocated) is not None and result.particles is not None:
             x, y, heading = moved.shift.tolist()
-            found = Relocalisation(moved.robot, (x, y, heading), len(moved.pairs), moved.was_lost)
+            found = Relocalisation(moved.robot, (x, y, heading), len(moved.pairs), moved.outcome)
             self._consistency.add_relocalisation(self.next_step - 1, found)
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys, found)
 
@@ -587,6 +588,11 @@ class FastSlam:
     def consistency(self) -> Consistency:
         """Consistency of the filter in its frames so far, with advice if it is inconsistent."""
         return self._consistency.report()
+
+    def diagnose(self, robot: int = 0) -> tuple[Cause, ...]:
+        """Return the likely mistakes in the set-up of a robot's readings so far, by `slam_backend.diagnosis`."""
+        own = self.logs[self._check_robot(robot)].arrays()
+        return diagnose_run(own, self.options.camera, self.options.motion)
 
     def log(self, robot: int = 0) -> RobotLog:
         """Return a copy of a robot's log: odometry, measured points and their data association."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam._kernels import REJECTED, STATIONARY
 from slam_backend.fastslam.step_input import MASKS, NO_INPUT, RobotInput, StepInput, check_rows
+from slam_backend.smoother.relocalisation import Outcome
 from slam_backend.state import (
     INT64,
     MAX_LANDMARKS,
@@ -217,21 +218,23 @@ class StepReport(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Relocalisation:
-    """A robot that was found at older landmarks of its map, a part of which it had built a second time.
+    """A robot that sees older landmarks of its map again where it has built that part a second time.
 
     Attributes:
         robot: Index of the robot.
-        shift: Difference [m, m, rad] of its pose to the one that was believed, map frame.
-        num_landmarks: Number of landmarks that were held twice and are now one.
-        was_lost: Whether the covariance that was claimed for its pose excludes the shift. False: a late loop closure.
+        shift: Difference [m, m, rad] of its pose by these landmarks to the one that was believed, map frame.
+        num_landmarks: Number of landmarks that were held twice.
+        outcome: "loop closed": the covariance that was claimed for its pose allows the shift. "found": it excludes the
+            shift, but the odometry jumped while the view stayed the same; the robot was lost. After both pose and map
+            are corrected. "suspected": the robot is lost, or another place looks alike; nothing is changed.
     """
 
-    STATE = State(robot=Int(), shift=Each(Float(), "3"), num_landmarks=Int(1), was_lost=Flag())
+    STATE = State(robot=Int(), shift=Each(Float(), "3"), num_landmarks=Int(1), outcome=Text(get_args(Outcome)))
 
     robot: int
     shift: tuple[float, float, float]
     num_landmarks: int
-    was_lost: bool
+    outcome: Outcome
 
     @property
     def distance(self) -> float:
@@ -248,7 +251,7 @@ class RejuvenationReport:
         ess: Effective sample size of the importance weights of whole paths, in [1, M]; NaN if none were computed.
         iterations: Number of iterations of the smoother.
         num_keys: Number of keyframes in the graph.
-        relocalisation: Robot that was found at older landmarks of its map; None: no robot.
+        relocalisation: Robot that sees older landmarks of its map elsewhere; None: no robot.
     """
 
     STATE = State(

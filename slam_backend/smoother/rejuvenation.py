@@ -87,7 +87,7 @@ class Rejuvenation(NamedTuple):
         ess: Effective sample size of the importance weights of all draws, at most M; NaN without draws.
         iterations: Iterations of the last descent.
         particles: New particles, or None.
-        relocated: A robot that returned to older landmarks without noticing it, and was moved there; None: no robot.
+        relocated: A robot that returned to older landmarks without noticing it; None: no robot.
     """
 
     graph: SlamGraph
@@ -313,12 +313,12 @@ class Smoother(NamedTuple):
         mode = optimize(grown, self.camera, self.options, None if is_last else self._most(LAST_STEPS))
         if not mode.reason:
             relocated = relocalise(relinearise(grown, mode), mode, known, self.alignment)
-            if relocated is not None:
-                moved = optimize(relocated.graph, self.camera, self.options)
+            if relocated is not None and (shifted := relocated.graph) is not None:
+                moved = optimize(shifted, self.camera, self.options)
                 if moved.reason:
                     relocated = None
                 else:
-                    grown, mode = relocated.graph, moved
+                    grown, mode = shifted, moved
             drawn = sample_particles(
                 grown, mode, self.camera, num_particles, self.rng, self.options, known, self.alignment.descriptor_gate
             )

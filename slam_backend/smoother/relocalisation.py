@@ -4,15 +4,15 @@ Landmarks of one robot that look like older ones that it saw elsewhere are align
 relative frame are. Where the alignment holds, the robot's path since then is moved, both landmarks of a pair become
 one, and the smoother continues from there. A motion that the claimed covariance of the robot's pose allows is a late
 loop closure: odometry and its noise stay as they are. Otherwise the robot was lost if there is a moment at which its
-view stayed the same while the odometry jumped: there the odometry is cut. Without such a moment the other place may be
-another one that looks alike, as a second corridor does, and nothing is done. (A view that changes while a robot hardly
-moves is no such moment: that happens at corners.)
+view stayed the same while the odometry jumped: there the odometry is cut. Without such a moment the robot may have been
+carried, or the other place may be another one that looks alike, as a second corridor does: that is reported, and
+nothing is done. (A view that changes while a robot hardly moves is no such moment: that happens at corners.)
 
 Landmarks that only other robots saw do not count: where these disagree, the start of the robot may be wrong and not its
 odometry, and a merge is to be undone.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -32,29 +32,33 @@ from slam_backend.smoother.reassociation import LandmarkTable
 MIN_PAIRS = 5  # landmarks seen again
 SAME_VIEW, VIEW = 3, 3  # landmarks in the last and in the next so many keys that tell a jump of the odometry
 LOST = 16.27  # squared Mahalanobis distance of the motion beyond which the pose was wrong, 99.9 % of 3 degrees
+Outcome = Literal["loop closed", "found", "suspected"]
 
 
 class Relocated(NamedTuple):
-    """A graph with a robot at its own older landmarks.
+    """A robot that sees its own older landmarks elsewhere.
 
     Attributes:
         robot: Index of the robot.
         shift: (3,) float64 [m, m, rad], map frame. Difference of its newest pose to the one that was believed.
         distance_sq: Squared Mahalanobis distance [-] of the shift, by the claimed covariance.
         pairs: (n, 2) int64 rows (id of the later landmark, id of the older one).
-        graph: Graph with the moved path and without the later landmarks, before the next descent.
+        graph: Graph with the moved path and without the later landmarks, before the next descent; None if the robot may
+            also be at another place that looks alike.
     """
 
     robot: int
     shift: FloatArray
     distance_sq: float
     pairs: IntArray
-    graph: SlamGraph
+    graph: SlamGraph | None
 
     @property
-    def was_lost(self) -> bool:
-        """Whether the claimed covariance excludes the motion."""
-        return self.distance_sq > LOST
+    def outcome(self) -> Outcome:
+        """What it means."""
+        if self.distance_sq <= LOST:
+            return "loop closed"
+        return "suspected" if self.graph is None else "found"
 
 
 class _Sightings(NamedTuple):
@@ -71,7 +75,7 @@ UNSEEN = -1
 def relocalise(
     graph: SlamGraph, mode: MapEstimate, known: LandmarkTable, options: AlignmentOptions
 ) -> Relocated | None:
-    """Return the robot whose later landmarks are older ones of the map; None if there is none.
+    """Return a robot whose later landmarks are older ones of the map, one that can be moved first; None without one.
 
     Args:
         graph: Graph at its mode.
@@ -86,6 +90,7 @@ def relocalise(
     looks = known.descriptors[at]
     alike = similar_pairs(looks, looks, options.descriptor_gate, options.max_similar + 1)  # each is like itself
     alike = alike[alike[:, 0] != alike[:, 1]]
+    suspected = None
     for robot in range(len(graph.last_keys)) if len(alike) >= 2 * MIN_PAIRS else ():
         seen = _sightings(graph, robot)
         split = _split(seen, rows[alike])
@@ -98,9 +103,10 @@ def relocalise(
         if found.success:
             pairs = np.column_stack([new.ids[found.inliers[:, 1]], old.ids[found.inliers[:, 0]]])
             relocated = _moved(graph, robot, found, pairs, seen, mode)
-            if relocated is not None:
+            if relocated.graph is not None:
                 return relocated
-    return None
+            suspected = suspected or relocated
+    return suspected
 
 
 def _sightings(graph: SlamGraph, robot: int) -> _Sightings:
@@ -144,8 +150,8 @@ def _map_of(graph: SlamGraph, known: LandmarkTable, rows: IntArray, at: IntArray
 
 def _moved(
     graph: SlamGraph, robot: int, found: Alignment, pairs: IntArray, seen: _Sightings, mode: MapEstimate
-) -> Relocated | None:
-    """Return the graph with the robot's later path at its older landmarks; None if no unknown pose lies between."""
+) -> Relocated:
+    """Return the graph with the robot's later path at its older landmarks; none if nothing explains the motion."""
     row = {int(name): i for i, name in enumerate(graph.landmark_ids)}
     new, old = (np.array([row[int(name)] for name in names]) for names in pairs.T)
     keys = np.flatnonzero((graph.robots == robot) & (mode.columns >= 0))
@@ -156,7 +162,7 @@ def _moved(
     if distance_sq > LOST:
         cut = _cut(keys, seen.last[old], seen.first[new])
         if cut is None:
-            return None
+            return Relocated(robot, shift, distance_sq, pairs, None)
         shares[keys[keys >= cut]] = 1.0
         noises, variances = noises.copy(), variances.copy()
         noises[cut], variances[cut] = np.diag(UNINFORMATIVE), UNINFORMATIVE[0]

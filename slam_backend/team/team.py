@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_int, check_kind, check_seed
+from slam_backend.diagnosis import Cause
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions
@@ -336,6 +337,11 @@ class TeamSlam:
     def consistency(self, robot: int) -> Consistency:
         """Return the consistency of the filter that a robot uses; see `FastSlam.consistency`."""
         return self._find(robot)[0].filter.consistency
+
+    def diagnose(self, robot: int) -> tuple[Cause, ...]:
+        """Return the likely mistakes in the set-up of a robot's readings so far; see `FastSlam.diagnose`."""
+        branch, index = self._find(robot)
+        return branch.filter.diagnose(index)
 
     def known_robots(self, robot: int) -> tuple[int, ...]:
         """Return the robots in the robot's filter, itself included, in ascending order.

@@ -8,11 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slam_backend.diagnosis import CAUSES, diagnose, find_motions
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
-from studies import mistakes
-from studies.mistakes import MOTION, Mistake, circle_log
+from slam_backend.team.team import TeamSlam
+from studies import circle_world
+from studies.circle_world import MOTION, Mistake, circle_log
 
 
 @pytest.mark.parametrize("by_names", [True, False])
@@ -25,6 +27,31 @@ def test_a_mistake_is_named_alone(mistake: Mistake, by_names: bool) -> None:
         assert [cause.name for cause in found] == ([] if mistake == "none" else [mistake])
         assert all(cause.text and "{" not in cause.text for cause in found)
         assert {cause.name for cause in found} <= CAUSES.keys()
+
+
+@pytest.mark.parametrize("mistake", get_args(Mistake))
+def test_a_filter_names_the_mistakes_in_its_own_readings(mistake: Mistake) -> None:
+    """With identities a filter says of its readings what is said of the log, in a team too."""
+    log = circle_log(mistake, 500)
+    slam, team = FastSlam(motion=MOTION, seed=0), TeamSlam(2, seed=0, motion=MOTION)
+    for odometry, frame, names in zip(log.odometry, log.measurements, log.identities, strict=True):
+        slam.step([odometry], [frame], [names])
+        team.step([None, odometry], [None, frame], identities=[None, names])
+    expected = [] if mistake == "none" else [mistake]
+    assert [cause.name for cause in slam.diagnose()] == [cause.name for cause in team.diagnose(1)] == expected
+    assert team.diagnose(0) == ()
+
+
+def test_a_filter_with_exact_poses_or_no_step_says_nothing() -> None:
+    """There is no odometry to judge."""
+    slam = FastSlam()
+    assert slam.diagnose() == ()
+    log = circle_log("sign of turns", 500)
+    for step in range(60):
+        slam.step([None], [log.measurements[step]], [log.identities[step]], poses=[np.zeros(3)])
+    assert slam.diagnose() == ()
+    with pytest.raises(ValueError, match="robot: expected"):
+        slam.diagnose(1)
 
 
 @settings(max_examples=20, deadline=None)
@@ -65,13 +92,13 @@ def test_a_delay_of_the_odometry_is_named_in_steps(late: int) -> None:
 
 def test_motions_are_those_of_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     """With hardly any noise the sightings tell the motion over each window, and their points fit as assumed."""
-    monkeypatch.setattr(mistakes, "POINT_NOISE", 1e-6)
+    monkeypatch.setattr(circle_world, "POINT_NOISE", 1e-6)
     log = circle_log("none", 3)
     found = find_motions(log.odometry, log.measurements, log.identities, StereoCamera(), MOTION)
     assert len(found.turns) == 30
-    steps = np.round(found.sighted[:, 2] / mistakes.MOVE[2])
+    steps = np.round(found.sighted[:, 2] / circle_world.MOVE[2])
     assert ((steps >= 9.0) & (steps <= 10.0)).all()
-    np.testing.assert_allclose(found.sighted[:, 2], steps * mistakes.MOVE[2], atol=1e-5)
+    np.testing.assert_allclose(found.sighted[:, 2], steps * circle_world.MOVE[2], atol=1e-5)
     chords = 2.0 * 4.0 * np.sin(0.5 * found.sighted[:, 2])
     np.testing.assert_allclose(np.hypot(*found.sighted[:, :2].T), chords, rtol=1e-3)  # the circle is a polygon
     assert found.fits.max() < 0.1  # the smallest variance of the fit adds to such small ones

@@ -9,7 +9,7 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Relocalisation
 from slam_backend.geometry import compose
 from slam_backend.models.measurements import Measurements
-from studies.mistakes import MOTION, MOVE, circle_log
+from studies.circle_world import MOTION, MOVE, circle_log
 
 AT, JUMP = 150, np.array([3.0, 2.0, 1.0])
 SOON = 110  # two rejuvenations: the first may fail
@@ -23,11 +23,15 @@ def true_path(steps: int) -> np.ndarray:
     return path
 
 
-def errors(slam: FastSlam, seed: int, at: int | None, alike: bool = False, names: bool = False) -> tuple[Any, Any]:
-    """Run a filter in the circle world; return the position errors (T,), and the relocalisations by step."""
+def errors(
+    slam: FastSlam, seed: int, at: int | None, alike: bool = False, names: bool = False, without: slice = slice(0)
+) -> tuple[Any, Any]:
+    """Run a filter in the circle world, `without` some steps; return position errors and relocalisations by step."""
     log, found = circle_log("none", seed), {}
     path, off = true_path(len(log.odometry)), []
-    for step, (move, frame, ids) in enumerate(zip(log.odometry, log.measurements, log.identities, strict=True)):
+    readings = list(enumerate(zip(log.odometry, log.measurements, log.identities, strict=True)))
+    del readings[without]
+    for step, (move, frame, ids) in readings:
         odometry = compose(move, JUMP) if step == at else move
         seen = Measurements(frame.points, np.ones_like(frame.descriptors)) if alike else frame
         report = slam.step([odometry], [seen], [ids] if names else None)
@@ -48,10 +52,10 @@ def test_a_robot_whose_odometry_jumped_is_found_and_its_map_is_one_again(seed: i
     assert off[AT:step].min() > 2.0
     assert off[step:].max() < 0.3
     assert slam.map_size == 30
-    assert told.was_lost
+    assert told.outcome == "found"
     assert told.distance > 2.0
     (warning,) = (one for one in slam.consistency.warnings if one.sign == "lost")
-    assert (warning.step, warning.num_landmarks) == (step, told.num_landmarks)
+    assert (warning.step, warning.num_landmarks, warning.found) == (step, told.num_landmarks, True)
     assert f"found at step {step}" in warning.text
     assert slam.consistency.to_mapping()["warnings"][-1]["sign"] == "lost"
 
@@ -63,6 +67,21 @@ def test_a_robot_with_right_odometry_is_never_lost(seed: int) -> None:
     off, found = errors(slam, seed, None)
     assert not found
     assert off.max() < 0.3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_robot_that_was_carried_says_so_once_and_is_not_moved(seed: int) -> None:
+    """Nothing tells a carried robot from one at a place that looks alike: one warning, and the map stays as it is."""
+    slam = FastSlam(motion=MOTION, seed=seed)
+    off, found = errors(slam, seed, None, without=slice(AT, AT + 30))
+    assert {one.outcome for one in found.values()} == {"suspected"}
+    assert min(found) <= AT + 30 + SOON
+    assert off[-1] > 2.0
+    (warning,) = (one for one in slam.consistency.warnings if one.sign == "lost")
+    assert not warning.found
+    assert warning.text.startswith("Perhaps lost at step")
+    assert warning.distance == pytest.approx(2.0 * 4.0 * np.sin(30 * MOVE[2] / 2.0), abs=0.5)  # the chord
+    assert slam.consistency.verdict == "perhaps lost"
 
 
 def test_landmarks_that_look_alike_tell_no_place() -> None:
@@ -111,4 +130,4 @@ def test_a_lost_robot_is_part_of_the_state() -> None:
 
 def test_the_distance_is_that_of_the_positions() -> None:
     """Headings do not count."""
-    assert Relocalisation(0, (3.0, -4.0, 1.0), 5, True).distance == 5.0
+    assert Relocalisation(0, (3.0, -4.0, 1.0), 5, "found").distance == 5.0

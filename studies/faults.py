@@ -1,8 +1,9 @@
-"""Robots that are lost: how soon filters notice, and whether they find themselves again.
+"""Faults of robots and logs: whether filters notice that a robot is lost, and what is said of a wrong set-up.
 
-python -m studies.kidnaps --seeds 20
+python -m studies.faults --seeds 20
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -13,25 +14,28 @@ from numpy.typing import NDArray
 
 from slam_backend.core.blas import single_threaded_blas
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.diagnosis import diagnose
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import compose, inverse, wrap_angle
 from slam_backend.models.measurements import Measurements
 from studies.bounds.episodes import record_episode
-from studies.mistakes import MOTION, MOVE, circle_log
+from studies.circle_world import MOTION, MOVE, Mistake, circle_log
 from training.bench.exploration.players import parted
 from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, first_seed, option
-from training.experiments.study import Column, ResultTable, Study
+from training.experiments.study import Column, ResultTable, Row, Study
 from training.replay.config import MRCLAM, find_log
 from training.replay.metrics import true_poses
 from training.replay.readers import read_mrclam
 from vslam_env import preset_config, vslam_v1
 
-World = Literal["circle", "office", "mrclam"]
+World = Literal["circle", "office", "maze", "loops", "hall", "rooms", "mrclam"]
 Event = Literal["jump", "carried", "none"]
+MISTAKES, EVENTS = get_args(Mistake), get_args(Event)
 JUMP = np.array([3.0, 2.0, 1.0])  # [m, m, rad] by which one odometry reading is wrong
-CUT = {"circle": 30, "office": 150, "mrclam": 400}  # steps of a drive that are left out
+CUT = {"circle": 30, "mrclam": 400}  # steps of a drive that are left out
+CUT_OF_FAMILIES = 150
 KNOWN = 5  # landmarks seen again after which a robot could know
 IN_TIME = 50  # steps within which it should
 
@@ -39,32 +43,42 @@ IN_TIME = 50  # steps within which it should
 
 
 class Config(ExperimentConfig):
-    """Robots whose odometry jumps once, that are carried, and others."""
+    """Robots whose odometry jumps once, that are carried, and others; logs with each mistake."""
 
     worlds: tuple[World, ...] = option(
-        ("circle", "office", "mrclam"), "Worlds: circle (of the SLAM tutorial), office, mrclam (data set 7)."
+        ("circle", "office", "mrclam"), "Worlds: circle (of the SLAM tutorial), families, mrclam (data set 7)."
     )
+    events: tuple[Event, ...] = option(EVENTS, "Events: jump (one wrong odometry reading), carried, none.")
+    mistakes: tuple[Mistake, ...] = option(MISTAKES, "Mistakes in the set-up of logs in the circle world.")
     seeds: int = option(20, "Number of trials in each world.", ge=1, hint="Use at least one.")
     seed: int = first_seed()
-    preset: Literal["standard", "hard"] = option("standard", "Noise preset in offices.")
+    preset: Literal["standard", "hard"] = option("standard", "Noise preset in families.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """One robot."""
+    """One robot, or one log."""
 
     world: World
-    event: Event  # One wrong reading of the odometry, a part of the drive without readings, or neither
+    event: Event | None  # One wrong reading of the odometry, a part of the drive without readings, or neither
+    mistake: Mistake | None  # Name of the mistake in a log that is diagnosed, as `diagnose` gives it
+    matches: Literal["identities", "descriptors"]  # Means to match landmarks
     seed: int  # Seed of the noise, the filter, and the time
 
 
 def trials(config: Config) -> list[Trial]:
     """Return all trials."""
+    seeds = range(config.seed, config.seed + config.seeds)
     return [
-        Trial(world=world, event=event, seed=seed)
+        Trial(world=world, event=event, mistake=None, matches="descriptors", seed=seed)
         for world in config.worlds
-        for seed in range(config.seed, config.seed + config.seeds)
-        for event in get_args(Event)
+        for seed in seeds
+        for event in config.events
+    ] + [
+        Trial(world="circle", event=None, mistake=mistake, matches=matches, seed=seed)
+        for mistake in config.mistakes
+        for matches in ("identities", "descriptors")
+        for seed in seeds
     ]
 
 
@@ -95,10 +109,10 @@ def drive(world: World, seed: int, preset: Literal["standard", "hard"]) -> Drive
         for step in range(1, len(path)):
             path[step] = compose(path[step - 1], MOVE)
         return Drive(log.odometry, log.measurements, log.identities, path, {"motion": MOTION})
-    if world == "office":
+    if world != "mrclam":
         player = parted("frontier@continuous")
         config = preset_config(preset).replace(
-            world="office", num_robots=1, max_seconds=120.0, action_type=player.action_type
+            world=world, num_robots=1, max_seconds=120.0, action_type=player.action_type
         )
         env = vslam_v1.parallel_env(config=config, observation_keys=player.observation_keys)
         episode = record_episode(env, player.make(env, 600.0), seed)
@@ -128,22 +142,36 @@ def _badges(names: IntArray) -> NDArray[np.float32]:
     return np.asarray(np.eye(32, dtype=np.float32)[np.asarray(names, np.int64) % 32])
 
 
-@single_threaded_blas
 def play(config: Config, trial: Trial) -> dict[str, Any]:
+    """Run the filter on a drive, or diagnose a log; see `run_filter` and `diagnosis`."""
+    return run_filter(config, trial) if trial.mistake is None else diagnosis(trial)
+
+
+def diagnosis(trial: Trial) -> dict[str, Any]:
+    """Return what is `said` of a log, and whether that is `right`: the mistake alone."""
+    assert trial.mistake is not None
+    log = circle_log(trial.mistake, trial.seed)
+    names = log.identities if trial.matches == "identities" else None
+    said = [cause.name for cause in diagnose(log.odometry, log.measurements, names, motion=MOTION)]
+    return {"said": ", ".join(said) or "none", "right": said == ([] if trial.mistake == "none" else [trial.mistake])}
+
+
+@single_threaded_blas
+def run_filter(config: Config, trial: Trial) -> dict[str, Any]:
     """Run the filter on a drive.
 
     Returns:
-        `warned`: whether a warning says that the robot was lost; `others`: number of warnings before that
-        or without; `worse`: number of relocalisations that made the error of the pose larger. `delay`: steps from the
-        first sight of five known landmarks until the warning, and `in_time`: whether it is at most `IN_TIME`; None if
-        five are never seen again. `before_m`, `lost_m`, `end_m`: position error before, the largest afterwards, and at
-        the end. `copies`: landmarks of the map for each true one.
+        `warned`: whether a warning says that the robot is or was lost; `others`: number of warnings before that
+        or without; `found`: number of relocalisations, `worse`: of those that made the error of the pose larger.
+        `delay`: steps from the first sight of five known landmarks until the warning, and `in_time`: whether it is at
+        most `IN_TIME`; None if five are never seen again. `before_m`, `lost_m`, `end_m`: position error before, the
+        largest afterwards, and at the end. `copies`: landmarks of the map for each true one.
     """
     own = drive(trial.world, trial.seed, config.preset)
     count, rng = len(own.odometry), np.random.default_rng((trial.seed, 1))
     at = int(count * rng.uniform(0.4, 0.6))
     if trial.event == "carried":
-        own = own.without(at, at + CUT[trial.world])
+        own = own.without(at, at + CUT.get(trial.world, CUT_OF_FAMILIES))
     odometry = own.odometry.copy()
     if trial.event == "jump":
         odometry[at] = compose(odometry[at], JUMP)
@@ -152,7 +180,8 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     for step in range(len(odometry)):
         report = slam.step([odometry[step]], [own.frames[step]])
         path[step] = slam.pose().mean
-        if report.rejuvenation is not None and report.rejuvenation.relocalisation is not None:
+        seen = None if report.rejuvenation is None else report.rejuvenation.relocalisation
+        if seen is not None and seen.outcome != "suspected":
             moved.append(step)
     warnings = [one.step for one in slam.consistency.warnings if one.sign == "lost"]
     known = {int(name) for names in own.true_ids[:at] for name in names if name >= 0}
@@ -164,7 +193,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
         "warned": late is not None, "could": could is not None,
         "others": len([step for step in warnings if step < at or trial.event == "none"]),
         "worse": sum(bool(errors[n] + apart[n] > errors[n - 1] + apart[n - 1]) for n in moved),
-        "moved": len(moved), "delay": None if could is None or late is None else late - could,
+        "found": len(moved), "delay": None if could is None or late is None else late - could,
         "in_time": None if could is None else late is not None and late - could <= IN_TIME,
         "before_m": float(np.nanmax(errors[: at - 1][-50:])), "lost_m": float(np.nanmax(errors[at:])),
         "end_m": float(errors[~np.isnan(errors)][-1]),
@@ -189,12 +218,17 @@ def _in_start_frame(path: FloatArray) -> FloatArray:
 # ---------------------------------------------------------------------- results
 
 
-STUDY = Study(
-    name="kidnaps",
-    about="""Let robots lose their pose, and see how soon filters notice it, and whether they find themselves again.
+def _said(rows: Sequence[Row]) -> str:
+    """Return what is said, with numbers."""
+    return ", ".join(f"{name} {count}" for name, count in Counter(row["said"] for row in rows).most_common())
 
-    Either one odometry reading is wrong by 3 m, 2 m and 1 rad, or the readings of a part of the drive are left out.
-    Robots with neither show false alarms.
+
+STUDY = Study(
+    name="faults",
+    about="""Let robots lose their pose, and see how soon filters notice; make mistakes, and see what is said of them.
+
+    Either one odometry reading is wrong by 3 m, 2 m and 1 rad, or the readings of a part of the drive are left out;
+    robots with neither show false alarms. Logs with each usual mistake in their set-up, and without, are diagnosed.
     """,
     config=Config,
     trial=Trial,
@@ -203,16 +237,22 @@ STUDY = Study(
     quick={"worlds": ("circle",), "seeds": 2},
     tables=(
         ResultTable(
-            name="kidnaps", title="Robots that are lost, and others", by=("world", "event"),
+            name="lost", title="Robots that are lost, and others", by=("world", "event"),
+            where=lambda row: row["mistake"] is None,
             columns=(
-                Column("warned", "lost [%]", digits=0, factor=100.0), Column("others", "others", "sum", digits=0),
-                Column("moved", "found", "sum", digits=0), Column("worse", "worse", "sum", digits=0),
+                Column("warned", "warned [%]", digits=0, factor=100.0), Column("others", "others", "sum", digits=0),
+                Column("found", "found", "sum", digits=0), Column("worse", "worse", "sum", digits=0),
                 Column("could", "could [%]", digits=0, factor=100.0),
                 Column("in_time", "soon [%]", digits=0, factor=100.0),
                 Column("delay", "delay [steps]", "median", digits=0), Column("before_m", "before [m]", digits=2),
                 Column("lost_m", "worst [m]", digits=2), Column("end_m", "end [m]", "median", digits=2),
                 Column("copies", digits=2),
             ),
+        ),
+        ResultTable(
+            name="mistakes", title="What is said of logs with one mistake each", by=("mistake", "matches"),
+            where=lambda row: row["mistake"] is not None,
+            columns=(Column("right", "right [%]", digits=0, factor=100.0), Column("said", "said", _said)),
         ),
     ),
 )  # fmt: skip

@@ -1,23 +1,13 @@
-"""Mistakes in the set-up of a log, each made in the circle world of the tutorial, and what `diagnose` says of it.
+"""The circle world of the SLAM tutorial, and mistakes in the set-up of its logs."""
 
-python -m studies.mistakes --seeds 20
-"""
-
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.diagnosis import diagnose
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from training.commands.study import run_program
-from training.experiments.config import ExperimentConfig, first_seed, option
-from training.experiments.study import Column, ResultTable, Row, Study
 
 Mistake = Literal[
     "none", "mirrored x", "sign of turns", "odometry in degrees", "points in centimetres", "odometry in centimetres",
@@ -28,38 +18,12 @@ STEPS, MOVE = 300, np.array([0.2, 0.0, 0.05])  # along a circle of 4 m radius, a
 POINT_NOISE, TOO_NOISY, WRONG_BASELINE = 0.01, 30.0, 1.2
 
 
-class Config(ExperimentConfig):
-    """Logs with each mistake, with identities and by descriptors."""
-
-    seeds: int = option(20, "Number of logs with each mistake.", ge=1, hint="Use at least one log.")
-    seed: int = first_seed()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
-    """One log."""
-
-    mistake: Mistake  # Name of the mistake, as `diagnose` gives it
-    matches: Literal["identities", "descriptors"]  # Means to match landmarks
-    seed: int  # Seed of the noise
-
-
 class CircleLog(NamedTuple):
     """Log of a robot: odometry (T, 3) [m, m, rad], measurements and their landmarks (n,)."""
 
     odometry: FloatArray
     measurements: list[Measurements]
     identities: list[IntArray]
-
-
-def trials(config: Config) -> list[Trial]:
-    """Return all trials."""
-    return [
-        Trial(mistake=mistake, matches=matches, seed=seed)
-        for mistake in get_args(Mistake)
-        for matches in ("identities", "descriptors")
-        for seed in range(config.seed, config.seed + config.seeds)
-    ]
 
 
 def circle_log(mistake: Mistake, seed: int) -> CircleLog:
@@ -99,39 +63,3 @@ def _wrong_odometry(odometry: FloatArray, mistake: Mistake) -> FloatArray:
         "odometry in centimetres": (100.0, 100.0, 1.0), "frozen odometry": (0.0, 0.0, 0.0),
     }  # fmt: skip
     return odometry * factors.get(mistake, (1.0, 1.0, 1.0))
-
-
-def play(config: Config, trial: Trial) -> dict[str, Any]:
-    """Diagnose a log; return what is `said`, and whether that is `right`: the mistake alone."""
-    log = circle_log(trial.mistake, trial.seed)
-    names = log.identities if trial.matches == "identities" else None
-    said = [cause.name for cause in diagnose(log.odometry, log.measurements, names, motion=MOTION)]
-    return {"said": ", ".join(said) or "none", "right": said == ([] if trial.mistake == "none" else [trial.mistake])}
-
-
-def _said(rows: Sequence[Row]) -> str:
-    """Return what is said, with numbers."""
-    return ", ".join(f"{name} {count}" for name, count in Counter(row["said"] for row in rows).most_common())
-
-
-STUDY = Study(
-    name="mistakes",
-    about="""Make each usual mistake in the set-up of a log, and print what the diagnosis says of it.
-
-    A robot drives on a circle amid a circle of landmarks, which have identities, or descriptors alone.
-    """,
-    config=Config,
-    trial=Trial,
-    trials=trials,
-    play=play,
-    quick={"seeds": 2},
-    tables=(
-        ResultTable(
-            name="mistakes", title="What is said of logs with one mistake each", by=("mistake", "matches"),
-            columns=(Column("right", "right [%]", digits=0, factor=100.0), Column("said", "said", _said)),
-        ),
-    ),
-)  # fmt: skip
-
-if __name__ == "__main__":
-    run_program(STUDY)
