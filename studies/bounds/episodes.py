@@ -135,20 +135,17 @@ class _Labels:
     """Names of landmarks over all maps of a team, joined where maps are merged."""
 
     def __init__(self, num_robots: int) -> None:
-        self._maps: tuple[int, ...] = tuple(range(num_robots))
         self._names: list[list[list[tuple[int, int] | None]]] = []  # (map, id) by tick, robot and measurement
-        self._held: dict[int, set[int]] = {number: set() for number in self._maps}  # ids of each map
+        self._held: dict[int, set[int]] = {number: set() for number in range(num_robots)}  # ids of each map
         self._joins: list[tuple[LandmarkIdMap | MapForked, list[tuple[tuple[int, int], tuple[int, int]]]]] = []
         self._merges: list[tuple[int, LandmarkIdMap]] = []
 
     def record(self, report: TeamReport) -> None:
         """Note the associations and changes of maps in a tick."""
-        tick = []
-        for robot, found in enumerate(report.associations):
-            number = self._maps[robot]
-            self._held[number].update(i for i in found.tolist() if i >= 0)
-            tick.append([(number, i) if i >= 0 else None for i in found.tolist()])
-        self._names.append(tick)
+        self._names.append([
+            [(number, i) if i >= 0 else None for i in found.tolist()]
+            for number, found in zip(maps_before_merges(report), report.associations, strict=True)
+        ])  # fmt: skip
         for change in report.map_changes:
             if isinstance(change, LandmarksCreated):
                 self._held.setdefault(change.number, set()).update(i for i in change.ids.tolist() if i >= 0)
@@ -165,7 +162,6 @@ class _Labels:
             elif isinstance(change, MergeUndone):
                 self._joins = [join for join in self._joins if getattr(join[0], "maps", None) != change.maps]
                 self._merges = [merge for merge in self._merges if merge[1].maps != change.maps]
-        self._maps = report.maps
 
     def merges(self) -> tuple[tuple[int, tuple[int, ...], tuple[int, ...]], ...]:
         """Return tick and groups of the merges that were not undone."""
@@ -196,6 +192,18 @@ class _Labels:
             )
             for tick in self._names
         )
+
+
+def maps_before_merges(report: TeamReport) -> list[int]:
+    """Return the number of each robot's map in a tick after losses of contact, and before merges and undos."""
+    maps = list(report.maps)
+    for change in reversed(report.map_changes):
+        if isinstance(change, LandmarkIdMap):
+            a, b, joint = change.maps
+            maps = [(a if k in change.robots_a else b) if held == joint else held for k, held in enumerate(maps)]
+        elif isinstance(change, MergeUndone):
+            maps = [change.maps[2] if held in change.maps else held for held in maps]
+    return maps
 
 
 def components(num_robots: int, merges: Iterable[tuple[int, Sequence[int], Sequence[int]]]) -> IntArray:

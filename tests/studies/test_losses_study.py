@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from scipy import stats
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import between, wrap_angle
-from studies.bounds.episodes import RecordedEpisode, components, record_episode, replay
+from slam_backend.team.reports import LandmarkIdMap, MapForked, MergeUndone
+from studies.bounds.episodes import RecordedEpisode, components, maps_before_merges, record_episode, replay
 from studies.bounds.ladder import (
     LADDER,
     Associations,
@@ -222,6 +224,18 @@ def test_errors_agree_with_the_predicted_covariances() -> None:
         total += float(error @ np.linalg.solve(online.covariances[0, -1] + 1e-10 * np.eye(3), error))
     low, high = stats.chi2.interval(1.0 - FALSE_ALARM, 3 * 20)
     assert low < total < high
+
+
+def test_associations_are_of_maps_before_merges_and_after_losses_of_contact() -> None:
+    """Ids of the same number, created in the tick in which a robot gets a map of its own, are different landmarks."""
+
+    def maps(after: tuple[int, ...], change: Any) -> list[int]:
+        report: Any = SimpleNamespace(maps=after, map_changes=(change,))
+        return maps_before_merges(report)
+
+    assert maps((5, 5, 5), LandmarkIdMap((0,), (1, 2), np.empty((0, 2), np.int64), (0, 1, 5))) == [0, 1, 1]
+    assert maps((0, 1, 1), MergeUndone((0, 1, 5))) == [5, 5, 5]
+    assert maps((5, 6, 5), MapForked(5, 6)) == [5, 6, 5]
 
 
 def test_groups_follow_merges_and_landmarks_are_fused_then() -> None:
