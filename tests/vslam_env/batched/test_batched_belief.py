@@ -1,0 +1,222 @@
+"""The Gaussian belief of a team: the formulas of the exact models, laws of the filter, and simulated drives."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from slam_backend.fastslam.options import FilterOptions
+from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
+from slam_backend.metrics import nees
+from slam_backend.models.camera import StereoCamera
+from slam_backend.models.odometry import OdometryModel
+
+jax = pytest.importorskip("jax", reason="jax, an optional extra, is not installed: pip install vslam-env[jax]")
+jnp = jax.numpy
+bf = pytest.importorskip("vslam_env.batched.belief")
+
+MOTION = OdometryModel(bias_scale=0.02, bias_heading=0.01)
+OPTIONS = FilterOptions(motion=MOTION, camera=StereoCamera(mount=(0.1, -0.05, 0.4)))
+MOST, TICKS, SIZE = 5, 150, 16
+
+
+class Drive(NamedTuple):
+    """Readings of robots on circles in T ticks, and their true paths (T, K, 3), each in its own start frame."""
+
+    odometry: np.ndarray
+    frames: Any
+    paths: np.ndarray
+
+
+def drive(seed: int, num_robots: int = 1, most: int = MOST, noise: float = 1.0) -> Drive:
+    """Return simulated readings; landmarks stand on a circle around that of the robots."""
+    rng, camera = np.random.default_rng(seed), OPTIONS.camera
+    angles = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+    marks = np.column_stack([5.0 * np.cos(angles), 5.0 * np.sin(angles) + 2.5, rng.uniform(0.1, 1.0, 40)])
+    descriptors = rng.normal(size=(40, SIZE)) / np.sqrt(SIZE)
+    shape = (TICKS, num_robots)
+    points, looks = np.zeros((*shape, most, 3)), np.zeros((*shape, most, SIZE))
+    points[..., 2] = 1.0
+    names, valid = np.full((*shape, most), -1), np.zeros((*shape, most), bool)
+    odometry, paths = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+    bias = noise * rng.normal(size=(num_robots, 3)) * [MOTION.bias_scale, MOTION.bias_heading, 0.0]
+    for t in range(TICKS):
+        for k in range(num_robots):
+            if t:
+                move = np.array([0.1, 0.0, 0.04])
+                paths[t, k] = compose(paths[t - 1, k], move)
+                read = move + OdometryModel.bias_jacobians(move[None])[0] @ bias[k]
+                odometry[t, k] = read + noise * rng.normal(size=3) * np.sqrt(MOTION.variances(read[None])[0])
+            local = np.column_stack([transform_points(inverse(paths[t, k]), marks[:, :2]), marks[:, 2]])
+            seen = camera.camera_from_robot(local)
+            near = rng.permutation(np.flatnonzero(camera.sees(seen)))[:MOST]
+            sigmas = [camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px]
+            pixels = camera.project(seen[near]) + noise * rng.normal(size=(len(near), 3)) * sigmas
+            points[t, k, : len(near)] = camera.triangulate(pixels)
+            looks[t, k, : len(near)] = descriptors[near] + 0.01 * rng.normal(size=(len(near), SIZE))
+            names[t, k, : len(near)], valid[t, k, : len(near)] = near, True
+    frames = bf.Frame(jnp.asarray(points), jnp.asarray(looks), jnp.asarray(names), jnp.asarray(valid))
+    return Drive(odometry, frames, paths)
+
+
+@partial(jax.jit, static_argnames=("assumed",))
+def run(belief: Any, odometry: Any, frames: Any, assumed: Any) -> Any:
+    """Return the belief at the end, and the robots and their covariances after each tick."""
+
+    def tick(so_far: Any, reading: Any) -> Any:
+        after = bf.step(so_far, *reading, assumed)
+        size = after.robots.size
+        return after, (after.robots, after.covariance[:size, :size])
+
+    return jax.lax.scan(tick, belief, (odometry, frames))
+
+
+def stacked(drives: Sequence[Drive]) -> tuple[Any, Any]:
+    """Return odometry and frames of several drives as a batch."""
+    frames = jax.tree.map(lambda *values: jnp.stack(values), *[each.frames for each in drives])
+    return jnp.stack([jnp.asarray(each.odometry) for each in drives]), frames
+
+
+ASSUMED = bf.Assumed.of(OPTIONS)
+predict, match, update = (
+    jax.jit(part, static_argnames=("assumed",)) for part in (bf.predict, bf.match, bf.update)
+)  # fmt: skip
+
+
+def started(num_robots: int = 1, rows: int = 64) -> Any:
+    """Return the belief at the start."""
+    return bf.start(num_robots, rows, SIZE, ASSUMED)
+
+
+def test_motion_is_that_of_the_odometry_model() -> None:
+    """The motion is the reading minus the error by the biases, and its noise that of the model, in the map frame."""
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        robot, odometry = rng.normal(size=5), rng.normal(size=3) * 0.3
+        expected = compose(robot[:3], odometry - MOTION.bias_jacobians(odometry[None])[0] @ [*robot[3:], 0.0])
+        found = np.asarray(bf.moved(jnp.asarray(robot), jnp.asarray(odometry)))
+        np.testing.assert_allclose(found[:2], expected[:2], atol=1e-5)
+        assert wrap_angle(found[2] - expected[2]) == pytest.approx(0.0, abs=1e-5)
+        variances = MOTION.variances(odometry[None])[0]
+        c, s = np.cos(robot[2]), np.sin(robot[2])
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        noise = np.asarray(bf.motion_noise(robot[2], jnp.asarray(odometry), ASSUMED))
+        np.testing.assert_allclose(noise[:3, :3], turn @ np.diag(variances) @ turn.T, rtol=1e-4, atol=1e-8)
+    standing = jax.jacfwd(bf.moved)(jnp.zeros(5), jnp.zeros(3))
+    assert np.isfinite(standing).all()
+
+
+def test_sights_are_those_of_the_camera() -> None:
+    """Places are where the camera sees them, and their noise is that of the stereo camera in the plane."""
+    rng, camera = np.random.default_rng(2), OPTIONS.camera
+    for _ in range(20):
+        robot, point = rng.normal(size=5), np.array([*rng.uniform(-1.0, 1.0, 2), rng.uniform(1.0, 6.0)])
+        local = camera.robot_from_camera(point)
+        world = compose(robot[:3], np.array([local[0], local[1], 0.0]))
+        seen = np.asarray(bf.seen_from(jnp.asarray(robot), jnp.asarray(world[:2]), ASSUMED))
+        np.testing.assert_allclose(seen, [point[2], -point[0]], atol=1e-4)
+        np.testing.assert_allclose(bf.place_of(jnp.asarray(robot), seen, ASSUMED), world[:2], atol=1e-4)
+        assert float(bf.height_of(jnp.asarray(point), point[2], ASSUMED)) == pytest.approx(local[2], abs=1e-5)
+        whole = camera.covariance(point)
+        planar = np.array([[whole[2, 2], -whole[2, 0]], [-whole[0, 2], whole[0, 0]]])
+        np.testing.assert_allclose(bf.sight_noise(seen, ASSUMED), planar, rtol=1e-3, atol=1e-9)
+
+
+def test_a_step_is_that_of_a_dense_kalman_filter() -> None:
+    """Prediction and update of one landmark equal the textbook formulas in double precision."""
+    readings = drive(3)
+    belief, _ = run(started(), readings.odometry, readings.frames, ASSUMED)
+    odometry, frame = np.full((1, 3), 1e-3), jax.tree.map(lambda v: v[-1, 0], readings.frames)
+    predicted = predict(belief, jnp.asarray(odometry), assumed=ASSUMED)
+    mean = np.concatenate([np.ravel(belief.robots), np.ravel(belief.places)]).astype(np.float64)
+    covariance = np.asarray(belief.covariance, np.float64)
+    motion = np.eye(len(mean))
+    motion[:5, :5] = jax.jacfwd(bf.moved)(belief.robots[0], jnp.asarray(odometry[0]))
+    expected = motion @ covariance @ motion.T
+    expected[:5, :5] += np.asarray(bf.motion_noise(belief.robots[0, 2], jnp.asarray(odometry[0]), ASSUMED))
+    np.testing.assert_allclose(predicted.covariance, expected, atol=1e-7)
+    rows = np.array(match(predicted, jnp.asarray(0), frame, assumed=ASSUMED).rows)
+    matched = int(np.flatnonzero(rows < 64)[0])
+    alone = np.where(np.arange(MOST) == matched, rows, 64)
+    updated = update(predicted, jnp.asarray(0), frame, jnp.asarray(alone), assumed=ASSUMED)
+    mean[:5], place = np.asarray(predicted.robots[0]), predicted.places[rows[matched]]
+    by_pose, by_place = jax.jacfwd(bf.seen_from, (0, 1))(predicted.robots[0], place, ASSUMED)
+    jacobian = np.zeros((2, len(mean)))
+    column = 5 + 2 * rows[matched]
+    jacobian[:, :5], jacobian[:, column : column + 2] = by_pose, by_place
+    seen = bf.seen_from(predicted.robots[0], place, ASSUMED)
+    innovation = jacobian @ expected @ jacobian.T + np.asarray(bf.sight_noise(seen, ASSUMED))
+    gain = expected @ jacobian.T @ np.linalg.inv(innovation)
+    point = frame.points[matched]
+    mean += gain @ (np.array([point[2], -point[0]]) - np.asarray(seen))
+    np.testing.assert_allclose(updated.robots.ravel(), mean[:5], atol=1e-5)
+    np.testing.assert_allclose(updated.places.ravel(), mean[5:], atol=1e-5)
+    np.testing.assert_allclose(updated.covariance, expected - gain @ innovation @ gain.T, atol=1e-7)
+
+
+def test_robots_find_their_way_and_each_landmark_once() -> None:
+    """Two robots come back to their landmarks; their parts are independent, and covariances symmetric and positive."""
+    readings = drive(4, num_robots=2)
+    belief, (robots, _) = run(started(2, 96), readings.odometry, readings.frames, ASSUMED)
+    errors = np.hypot(*np.moveaxis(np.asarray(robots)[..., :2] - readings.paths[..., :2], -1, 0))
+    assert errors.max() < 0.15
+    counts, names, owners = (np.asarray(part) for part in (belief.counts, belief.names, belief.owners))
+    for robot in range(2):
+        held = names[(counts > 0) & (owners == robot)]
+        assert len(held) == len(set(held.tolist())) > 30
+    covariance = np.asarray(belief.covariance)
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance.astype(np.float64)).min() > -1e-6
+    assert not covariance[:5, 5:10].any()
+    of_second = 10 + 2 * np.flatnonzero((counts > 0) & (owners == 1))
+    assert not covariance[:5, of_second].any()
+
+
+def test_errors_agree_with_the_covariance() -> None:
+    """NEES of the pose at the end is chi-square: its sum over 40 runs lies within 99.9 % bounds."""
+    drives = [drive(100 + seed) for seed in range(40)]
+    odometry, frames = stacked(drives)
+    _, (robots, covariances) = jax.vmap(run, (None, 0, 0, None))(started(), odometry, frames, ASSUMED)
+    errors = np.asarray(robots)[:, -1, 0, :3] - np.array([each.paths[-1, 0] for each in drives])
+    errors[:, 2] = wrap_angle(errors[:, 2])
+    found = nees(errors, np.asarray(covariances, np.float64)[:, -1, :3, :3])
+    assert chi2.ppf(0.0005, 120) < sum(found) < chi2.ppf(0.9995, 120)
+
+
+def test_padding_and_batches_change_nothing() -> None:
+    """Frames with more room give the same belief, and a batch gives for each run what it gives alone."""
+    narrow, wide = drive(5), drive(5, most=MOST + 3)
+    one, more = (run(started(), each.odometry, each.frames, ASSUMED)[0] for each in (narrow, wide))
+    np.testing.assert_allclose(one.robots, more.robots, atol=1e-5)
+    np.testing.assert_array_equal(one.counts, more.counts)
+    odometry, frames = stacked([drive(5), drive(6)])
+    both = jax.vmap(run, (None, 0, 0, None))(started(), odometry, frames, ASSUMED)[0]
+    np.testing.assert_allclose(both.robots[0], one.robots, atol=1e-4)
+    np.testing.assert_array_equal(both.counts[0], one.counts)
+
+
+def test_empty_frames_and_full_tables_leave_numbers() -> None:
+    """Without measurements the belief is dead reckoning; without free rows landmarks are left out."""
+    readings = drive(7)
+    blind = readings.frames._replace(valid=jnp.zeros_like(readings.frames.valid))
+    belief, (robots, _) = run(started(), readings.odometry, blind, ASSUMED)
+    path = np.zeros(3)
+    for move in readings.odometry[:, 0]:
+        path = compose(path, move)
+    np.testing.assert_allclose(np.asarray(robots)[-1, 0, :2], path[:2], atol=1e-3)
+    assert not np.asarray(belief.counts).any()
+    full, _ = run(started(rows=6), readings.odometry, readings.frames, ASSUMED)
+    assert (np.asarray(full.counts) > 0).all()
+    assert all(np.isfinite(part).all() for part in jax.tree.leaves(full))
+
+
+def test_what_is_assumed_is_that_of_the_options() -> None:
+    """Each field comes from the camera, the odometry, or the gates."""
+    changed = replace(OPTIONS, position_gate=9.0, motion=replace(MOTION, sigma_turn=0.07))
+    found = bf.Assumed.of(changed)
+    assert (found.focal, found.mount) == (OPTIONS.camera.focal_px, (0.1, -0.05, 0.4))
+    assert (found.position_gate, found.sigma_turn) == (9.0, 0.07)

@@ -1,0 +1,1 @@
+"""Beliefs in arrays of fixed shape, for batches of teams on an accelerator; needs the extra `jax`."""
