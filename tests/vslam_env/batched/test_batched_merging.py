@@ -1,0 +1,131 @@
+"""Merging of groups within one Gaussian: moves and conditioning by the formulas, and consistent teams."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from builders.batched import ASSUMED, drive, jax, jnp, run, stacked, started
+from scipy.stats import chi2
+
+from slam_backend.geometry import between, compose, inverse, wrap_angle
+from slam_backend.metrics import align_se2, nees
+
+merging = pytest.importorskip("vslam_env.batched.merging")
+ROWS, MOST_PAIRS = 96, 40
+
+
+def both_maps(seed: int) -> tuple[Any, Any]:
+    """Return the belief of two robots that drove apart, and their readings."""
+    readings = drive(seed, num_robots=2)
+    return run(started(2, ROWS), readings.odometry, readings.frames, ASSUMED)[0], readings
+
+
+def common(belief: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows (q, 2) of landmarks that both robots hold, padded, and which are valid."""
+    names, owners = np.asarray(belief.names), np.asarray(belief.owners)
+    held = np.asarray(belief.counts) > 0
+    sides = [{int(names[row]): row for row in np.flatnonzero(held & (owners == robot))} for robot in range(2)]
+    pairs = [(sides[0][name], sides[1][name]) for name in sorted(sides[0].keys() & sides[1].keys())]
+    padded = np.zeros((MOST_PAIRS, 2), np.int64)
+    padded[: len(pairs)] = pairs
+    return padded, np.arange(MOST_PAIRS) < len(pairs)
+
+
+def joined(belief: Any) -> Any:
+    """Return the belief after a merge of both robots, one of which has another frame, by their common landmarks."""
+    pairs, valid = common(belief)
+    away = merging.moved_group(belief, 1, jnp.array([3.0, -5.0, 2.0]), jnp.zeros((3, 3)))
+    places = np.asarray(away.places, np.float64)
+    motion = align_se2(places[pairs[valid, 0]], places[pairs[valid, 1]])
+    covariance = np.diag([0.02, 0.02, 0.01]) ** 2
+    return merging.joined(away, 0, 1, jnp.asarray(motion), jnp.asarray(covariance), jnp.asarray(pairs), valid)
+
+
+def test_a_group_that_is_moved_and_moved_back_is_as_before() -> None:
+    """A known motion changes the group alone, keeps its distances, and its inverse takes it back."""
+    belief, _ = both_maps(1)
+    motion, nothing = np.array([1.0, -2.0, 0.7]), jnp.zeros((3, 3))
+    moved = merging.moved_group(belief, 1, jnp.asarray(motion), nothing)
+    np.testing.assert_array_equal(moved.robots[0], belief.robots[0])
+    expected = compose(motion, np.asarray(belief.robots[1, :3], np.float64))
+    np.testing.assert_allclose(moved.robots[1, :2], expected[:2], atol=1e-5)
+    assert wrap_angle(float(moved.robots[1, 2]) - expected[2]) == pytest.approx(0.0, abs=1e-5)
+    back = merging.moved_group(moved, 1, jnp.asarray(inverse(motion)), nothing)
+    np.testing.assert_allclose(back.robots, belief.robots, atol=1e-5)
+    np.testing.assert_allclose(back.places, belief.places, atol=1e-5)
+    np.testing.assert_allclose(back.covariance, belief.covariance, atol=1e-7)
+    uncertain = merging.moved_group(belief, 1, jnp.asarray(motion), jnp.eye(3) * 0.01)
+    extra = np.asarray(uncertain.covariance - moved.covariance, np.float64)
+    assert np.linalg.matrix_rank(extra, tol=1e-4) == 3
+    assert extra[5, 5] > 0.01
+    assert not extra[:5].any()
+
+
+def test_a_merge_is_conditioning_on_equal_places() -> None:
+    """Mean and covariance are those of the dense formulas in double precision, for all but the freed rows."""
+    belief, _ = both_maps(2)
+    pairs, valid = common(belief)
+    motion, spread = jnp.array([0.01, -0.02, 0.005]), jnp.diag(jnp.array([4e-4, 4e-4, 1e-4]))
+    moved = merging.moved_group(belief, 1, motion, merging.LOOSE**2 * spread)
+    mean = np.concatenate([np.ravel(moved.robots), np.ravel(moved.places)]).astype(np.float64)
+    covariance = np.asarray(moved.covariance, np.float64)
+    jacobian = np.zeros((2 * valid.sum(), len(mean)))
+    for i, (kept, other) in enumerate(pairs[valid]):
+        for axis in range(2):
+            jacobian[2 * i + axis, 10 + 2 * kept + axis] = 1.0
+            jacobian[2 * i + axis, 10 + 2 * other + axis] = -1.0
+    innovation = jacobian @ covariance @ jacobian.T + merging.EQUAL**2 * np.eye(len(jacobian))
+    gain = np.linalg.solve(innovation, jacobian @ covariance).T
+    mean -= gain @ jacobian @ mean
+    covariance -= gain @ jacobian @ covariance
+    found = merging.joined(belief, 0, 1, motion, spread, jnp.asarray(pairs), valid)
+    stay = np.ones(len(mean), bool)
+    stay[(10 + 2 * pairs[valid, 1][:, None] + np.arange(2)).ravel()] = False
+    np.testing.assert_allclose(found.robots.ravel(), mean[:10], atol=1e-4)
+    np.testing.assert_allclose(
+        np.asarray(found.covariance)[np.ix_(stay, stay)], covariance[np.ix_(stay, stay)], atol=2e-6
+    )
+    assert not np.asarray(found.covariance)[~stay].any()
+    assert (np.asarray(found.counts)[pairs[valid, 1]] == 0).all()
+    total = np.asarray(belief.counts)[pairs[valid]].sum(axis=1)
+    np.testing.assert_array_equal(np.asarray(found.counts)[pairs[valid, 0]], total)
+
+
+def test_merged_robots_share_one_map_and_go_on() -> None:
+    """After a merge each landmark is held once, both robots measure it, and errors stay small."""
+    belief, readings = both_maps(3)
+    merged = joined(belief)
+    assert np.asarray(merged.groups).tolist() == [0, 0]
+    standing = np.zeros_like(readings.odometry)
+    still = jax.tree.map(lambda values: jnp.repeat(values[-1:], len(values), axis=0), readings.frames)
+    after, (robots, _) = run(merged, standing, still, ASSUMED)
+    names, counts = np.asarray(after.names), np.asarray(after.counts)
+    assert len(names[counts > 0]) == len(set(names[counts > 0].tolist()))
+    errors = np.asarray(robots)[-1, :, :2] - readings.paths[-1, :, :2]
+    assert np.hypot(*errors.T).max() < 0.15
+
+
+def test_merged_robots_know_how_well_they_know_each_other() -> None:
+    """NEES of the pose of one robot as the other sees it is chi-square over 30 teams: nothing is counted twice."""
+    drives = [drive(200 + seed, num_robots=2) for seed in range(30)]
+    odometry, frames = stacked(drives)
+    beliefs, _ = jax.vmap(run, (None, 0, 0, None))(started(2, ROWS), odometry, frames, ASSUMED)
+    found = []
+    for row, readings in enumerate(drives):
+        merged = joined(jax.tree.map(lambda values, row=row: values[row], beliefs))
+        poses, truth = np.asarray(merged.robots[:, :3], np.float64), readings.paths[-1]
+        error = between(poses[0], poses[1]) - between(truth[0], truth[1])
+        error[2] = wrap_angle(error[2])
+        first, second = (np.asarray(by) for by in jax.jacfwd(seen_pose, (0, 1))(*jnp.asarray(poses)))
+        among = np.asarray(merged.covariance, np.float64)
+        blocks = [[among[5 * i : 5 * i + 3, 5 * j : 5 * j + 3] for j in range(2)] for i in range(2)]
+        jacobian = np.hstack([first, second])
+        found.append(float(nees(error[None], (jacobian @ np.block(blocks) @ jacobian.T)[None])[0]))
+    assert chi2.ppf(0.0005, 90) < sum(found) < chi2.ppf(0.9995, 90)
+
+
+def seen_pose(first: Any, second: Any) -> Any:
+    """Return a pose (3,) in the frame of another."""
+    c, s = jnp.cos(first[2]), jnp.sin(first[2])
+    dx, dy = second[0] - first[0], second[1] - first[1]
+    return jnp.stack([c * dx + s * dy, c * dy - s * dx, second[2] - first[2]])
