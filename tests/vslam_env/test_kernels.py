@@ -43,11 +43,12 @@ print(after.mi_alloc - before.mi_alloc, after.mi_free - before.mi_free)
 
 
 def kernels() -> Iterator[Dispatcher]:
-    """All kernels of both packages, by whatever name they are imported."""
+    """All kernels of both packages, by whatever name they are imported; batched teams have none, and need jax."""
     for package in (slam_backend, vslam_env):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            found = vars(importlib.import_module(module.name)).values()
-            yield from (thing for thing in found if isinstance(thing, Dispatcher))
+            if not module.name.startswith("vslam_env.batched."):
+                found = vars(importlib.import_module(module.name)).values()
+                yield from (thing for thing in found if isinstance(thing, Dispatcher))
 
 
 def is_in_place(kernel: Dispatcher) -> bool:
