@@ -16,7 +16,7 @@ def moved_group(belief: Belief, group: Array, motion: Array, covariance: Array) 
     Args:
         group: () int32. First robot of the group.
         motion: (3,) [m, m, rad]. Motion (tx, ty, theta) from the group's frame to the new one.
-        covariance: (3, 3). Its covariance, independent of all else.
+        covariance: (3, 3). Covariance of the motion, which is independent of all else.
     """
     x, y, turn = motion
     c, s = jnp.cos(turn), jnp.sin(turn)
@@ -68,7 +68,7 @@ def joined(
     Args:
         a, b: () int32. First robots of both groups.
         motion: (3,) [m, m, rad]. Motion from frame b to frame a, by an alignment of both maps.
-        covariance: (3, 3). Its covariance.
+        covariance: (3, 3). Covariance of the motion.
         pairs: (q, 2) int32. Rows of landmarks of a and of b, one-to-one.
         valid: (q,) bool. Pairs that count.
     """
