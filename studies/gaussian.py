@@ -50,12 +50,12 @@ def play(config: Config, trial: losses.Trial) -> dict[str, Any]:
         PolicyError: If the policy fails.
     """
     episode = losses.recorded(config, trial)
-    path, names = gaussian_path(episode)
+    path, true_ids = gaussian_path(episode)
     track = replay(episode, episode.config.belief.filter)
     own, other = (
         float(np.sqrt((losses.errors_of(p, episode)[..., :2] ** 2).sum(-1).mean())) for p in (track.paths, path[None])
     )
-    real = names[names >= 0]
+    real = true_ids[true_ids >= 0]
     return {
         "filter": own, "gaussian": other, "ratio": losses.ratio(other, own),
         "copies": len(real) / max(len(np.unique(real)), 1),
@@ -72,14 +72,14 @@ def gaussian_path(episode: RecordedEpisode) -> tuple[Any, Any]:
     assumed = Assumed.of(episode.config.belief.filter)
     seen = [tick[0].measurements for tick in episode.readings]
     most, size = max(map(len, seen)), seen[0].descriptors.shape[1]
-    points, looks = np.zeros((len(seen), 1, most, 3)), np.zeros((len(seen), 1, most, size))
+    points, descriptors = np.zeros((len(seen), 1, most, 3)), np.zeros((len(seen), 1, most, size))
     points[..., 2] = 1.0
-    names, valid = np.full((len(seen), 1, most), -1), np.zeros((len(seen), 1, most), bool)
+    true_ids, valid = np.full((len(seen), 1, most), -1), np.zeros((len(seen), 1, most), bool)
     for tick, (own, ids) in enumerate(zip(seen, episode.true_ids, strict=True)):
         count = len(own)
-        points[tick, 0, :count], looks[tick, 0, :count] = own.points, own.descriptors
-        names[tick, 0, :count], valid[tick, 0, :count] = ids[0], True
-    frames = Frame(*map(jnp.asarray, (points, looks, names, valid)))
+        points[tick, 0, :count], descriptors[tick, 0, :count] = own.points, own.descriptors
+        true_ids[tick, 0, :count], valid[tick, 0, :count] = ids[0], True
+    frames = Frame(*map(jnp.asarray, (points, descriptors, true_ids, valid)))
     odometry = np.vstack([np.zeros((1, 3)), episode.odometry[0]])[:, None]
 
     def after_tick(belief: Any, reading: Any) -> Any:
@@ -88,7 +88,7 @@ def gaussian_path(episode: RecordedEpisode) -> tuple[Any, Any]:
 
     first = start(1, ROWS, size, assumed)
     last, path = jax.jit(partial(jax.lax.scan, after_tick))(first, (jnp.asarray(odometry), frames))
-    return np.asarray(path, np.float64), np.asarray(last.names)[np.asarray(last.counts) > 1]
+    return np.asarray(path, np.float64), np.asarray(last.true_ids)[np.asarray(last.counts) > 1]
 
 
 STUDY = Study(

@@ -34,11 +34,11 @@ def drive(seed: int, num_robots: int = 1, most: int = MOST, noise: float = 1.0) 
     rng, camera = np.random.default_rng(seed), OPTIONS.camera
     angles = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
     marks = np.column_stack([5.0 * np.cos(angles), 5.0 * np.sin(angles) + 2.5, rng.uniform(0.1, 1.0, 40)])
-    descriptors = rng.normal(size=(40, SIZE)) / np.sqrt(SIZE)
+    of_marks = rng.normal(size=(40, SIZE)) / np.sqrt(SIZE)
     shape = (TICKS, num_robots)
-    points, looks = np.zeros((*shape, most, 3)), np.zeros((*shape, most, SIZE))
+    points, descriptors = np.zeros((*shape, most, 3)), np.zeros((*shape, most, SIZE))
     points[..., 2] = 1.0
-    names, valid = np.full((*shape, most), -1), np.zeros((*shape, most), bool)
+    true_ids, valid = np.full((*shape, most), -1), np.zeros((*shape, most), bool)
     odometry, paths = np.zeros((*shape, 3)), np.zeros((*shape, 3))
     bias = noise * rng.normal(size=(num_robots, 3)) * [MOTION.bias_scale, MOTION.bias_heading, 0.0]
     for t in range(TICKS):
@@ -54,9 +54,9 @@ def drive(seed: int, num_robots: int = 1, most: int = MOST, noise: float = 1.0) 
             sigmas = [camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px]
             pixels = camera.project(seen[near]) + noise * rng.normal(size=(len(near), 3)) * sigmas
             points[t, k, : len(near)] = camera.triangulate(pixels)
-            looks[t, k, : len(near)] = descriptors[near] + 0.01 * rng.normal(size=(len(near), SIZE))
-            names[t, k, : len(near)], valid[t, k, : len(near)] = near, True
-    frames = bf.Frame(jnp.asarray(points), jnp.asarray(looks), jnp.asarray(names), jnp.asarray(valid))
+            descriptors[t, k, : len(near)] = of_marks[near] + 0.01 * rng.normal(size=(len(near), SIZE))
+            true_ids[t, k, : len(near)], valid[t, k, : len(near)] = near, True
+    frames = bf.Frame(jnp.asarray(points), jnp.asarray(descriptors), jnp.asarray(true_ids), jnp.asarray(valid))
     return Drive(odometry, frames, paths)
 
 

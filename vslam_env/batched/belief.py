@@ -60,14 +60,14 @@ class Frame(NamedTuple):
 
     Attributes:
         points: (B, 3) float32 [m], camera frame.
-        looks: (B, D) float32. Descriptors.
-        names: (B,) int32. True landmarks, for scores alone; -1: of none.
+        descriptors: (B, D) float32. Descriptors.
+        true_ids: (B,) int32. True landmarks, for scores alone; -1: of none.
         valid: (B,) bool. Whether there is a measurement.
     """
 
     points: Array
-    looks: Array
-    names: Array
+    descriptors: Array
+    true_ids: Array
     valid: Array
 
 
@@ -79,9 +79,9 @@ class Belief(NamedTuple):
         places: (R, 2) float32 [m], map frame of the group.
         covariance: (n, n) float32, symmetric.
         heights: (R, 2) float32 [m, m^2]. Height of each landmark above the floor, and its variance.
-        looks: (R, D) float32. Mean descriptors.
+        descriptors: (R, D) float32. Mean descriptors.
         counts: (R,) int32. Measurements of each landmark; 0: a free row.
-        names: (R,) int32. True landmark of the first measurement, for scores alone; -1: of none.
+        true_ids: (R,) int32. True landmark of the first measurement, for scores alone; -1: of none.
         owners: (R,) int32. First robot of the group that holds each landmark.
         groups: (K,) int32. First robot of each robot's group.
     """
@@ -90,9 +90,9 @@ class Belief(NamedTuple):
     places: Array
     covariance: Array
     heights: Array
-    looks: Array
+    descriptors: Array
     counts: Array
-    names: Array
+    true_ids: Array
     owners: Array
     groups: Array
 
@@ -108,7 +108,7 @@ def start(num_robots: int, rows: int, size: int, assumed: Assumed) -> Belief:
     return Belief(
         robots=jnp.zeros((num_robots, ROBOT)), places=jnp.zeros((rows, 2)),
         covariance=jnp.diag(jnp.concatenate([variances, jnp.zeros(2 * rows)])), heights=jnp.zeros((rows, 2)),
-        looks=jnp.zeros((rows, size)), counts=jnp.zeros(rows, jnp.int32), names=jnp.full(rows, -1, jnp.int32),
+        descriptors=jnp.zeros((rows, size)), counts=jnp.zeros(rows, jnp.int32), true_ids=jnp.full(rows, -1, jnp.int32),
         owners=jnp.zeros(rows, jnp.int32), groups=jnp.arange(num_robots, dtype=jnp.int32),
     )  # fmt: skip
 
@@ -170,6 +170,11 @@ def seen_from(robot: Array, place: Array, assumed: Assumed) -> Array:
     return jnp.stack([c * dx + s * dy - assumed.mount[0], c * dy - s * dx - assumed.mount[1]])
 
 
+def in_plane(points: Array) -> Array:
+    """Return measured points (..., 3), camera frame, as (ahead, left) of the camera (..., 2) [m]."""
+    return jnp.stack([points[..., 2], -points[..., 0]], axis=-1)
+
+
 def place_of(robot: Array, seen: Array, assumed: Assumed) -> Array:
     """Return the place (2,) that a robot (5,) sees at (ahead, left) of its camera [m]: the inverse of `seen_from`."""
     ahead, left = seen[0] + assumed.mount[0], seen[1] + assumed.mount[1]
@@ -195,6 +200,12 @@ def height_of(points: Array, depth: Array, assumed: Assumed) -> Array:
     return assumed.mount[2] - points[..., 1] / points[..., 2] * depth
 
 
+def _of_robot(belief: Belief, robot: Array) -> tuple[Array, Array]:
+    """Return the covariances of a robot with all variables (5, n), and with itself (5, 5)."""
+    own = jax.lax.dynamic_slice(belief.covariance, (ROBOT * robot, 0), (ROBOT, len(belief.covariance)))
+    return own, jax.lax.dynamic_slice(own, (0, ROBOT * robot), (ROBOT, ROBOT))
+
+
 class _Matches(NamedTuple):
     """Rows (B,) of matched landmarks, R without one, and whether measurements are new landmarks (B,)."""
 
@@ -213,15 +224,15 @@ def match(belief: Belief, robot: Array, frame: Frame, assumed: Assumed) -> _Matc
     seen = jax.vmap(seen_from, (None, 0, None))(pose, place, assumed)
     by_pose, by_place = jax.vmap(jax.jacfwd(seen_from, (0, 1)), (None, 0, None))(pose, place, assumed)
     first = belief.first_place
-    own = jax.lax.dynamic_slice(belief.covariance, (ROBOT * robot, 0), (ROBOT, len(belief.covariance)))
-    corner = jax.lax.dynamic_slice(own, (0, ROBOT * robot), (ROBOT, ROBOT))
+    own, corner = _of_robot(belief, robot)
     cross = own[:, first:].reshape(ROBOT, rows, 2)
     blocks = belief.covariance[first:, first:].reshape(rows, 2, rows, 2)[jnp.arange(rows), :, jnp.arange(rows)]
     mixed = jnp.einsum("ria,arb,rjb->rij", by_pose, cross, by_place)
     spread = jnp.einsum("ria,ab,rjb->rij", by_pose, corner, by_pose) + mixed + mixed.swapaxes(1, 2)
     spread += jnp.einsum("ria,rab,rjb->rij", by_place, blocks, by_place)
     spread += jax.vmap(sight_noise, (0, None))(seen, assumed)
-    off = jnp.stack([frame.points[:, 2], -frame.points[:, 0]], axis=-1)[:, None] - seen
+    measured = in_plane(frame.points)
+    off = measured[:, None] - seen
     determinant = spread[:, 0, 0] * spread[:, 1, 1] - spread[:, 0, 1] ** 2
     quadratic = (
         spread[:, 1, 1] * off[..., 0] ** 2 - 2.0 * spread[:, 0, 1] * off[..., 0] * off[..., 1]
@@ -231,10 +242,10 @@ def match(belief: Belief, robot: Array, frame: Frame, assumed: Assumed) -> _Matc
     slope = (frame.points[:, 1] / frame.points[:, 2])[:, None]
     tall = pixel_noise(seen[:, 0], assumed) + belief.heights[:, 1] + slope**2 * spread[:, 0, 0]
     distance = quadratic / jnp.maximum(determinant, 1e-20) + (heights - belief.heights[:, 0]) ** 2 / tall
-    looks = jnp.linalg.norm(frame.looks[:, None] - belief.looks, axis=-1)
+    unlike = jnp.linalg.norm(frame.descriptors[:, None] - belief.descriptors, axis=-1)
     held = (belief.counts > 0) & (belief.owners == belief.groups[robot])
-    alike = held & (looks < assumed.descriptor_gate) & frame.valid[:, None]
-    cost = distance + jnp.log(jnp.maximum(determinant, 1e-20)) + (looks / assumed.descriptor_sigma) ** 2
+    alike = held & (unlike < assumed.descriptor_gate) & frame.valid[:, None]
+    cost = distance + jnp.log(jnp.maximum(determinant, 1e-20)) + (unlike / assumed.descriptor_sigma) ** 2
     cost = jnp.where(alike & (distance < assumed.position_gate) & (seen[:, 0] > 0.0), cost, jnp.inf)
 
     def choose(_: int, so_far: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -246,7 +257,7 @@ def match(belief: Belief, robot: Array, frame: Frame, assumed: Assumed) -> _Matc
         return jnp.where(taken & is_match, jnp.inf, open_costs), chosen
 
     _, chosen = jax.lax.fori_loop(0, count, choose, (cost, jnp.full(count, rows)))
-    places = jax.vmap(place_of, (None, 0, None))(pose, off[:, 0] + seen[0], assumed)
+    places = jax.vmap(place_of, (None, 0, None))(pose, measured, assumed)
     close = jnp.linalg.norm(places[:, None] - place, axis=-1) < assumed.new_landmark_radius
     near = (alike & (close | (distance < assumed.new_landmark_gate))).any(axis=1)
     return _Matches(chosen, frame.valid & (chosen == rows) & ~near)
@@ -257,7 +268,7 @@ def update(belief: Belief, robot: Array, frame: Frame, rows: Array, assumed: Ass
     count, first = len(rows), belief.first_place
     used = rows < len(belief.counts)
     pose, places = belief.robots[robot], belief.places[rows]
-    measured = jnp.stack([frame.points[:, 2], -frame.points[:, 0]], axis=-1)
+    measured = in_plane(frame.points)
     seen = jax.vmap(seen_from, (None, 0, None))(pose, places, assumed)
     by_pose, by_place = jax.vmap(jax.jacfwd(seen_from, (0, 1)), (None, 0, None))(pose, places, assumed)
     by_pose, by_place = (jnp.where(used[:, None, None], by, 0.0) for by in (by_pose, by_place))
@@ -270,23 +281,39 @@ def update(belief: Belief, robot: Array, frame: Frame, rows: Array, assumed: Ass
     noise = jnp.where(used[:, None, None], jax.vmap(sight_noise, (0, None))(seen, assumed), jnp.eye(2))
     innovation = jacobian @ gain[columns]
     innovation = innovation.reshape(count, 2, count, 2).at[each, :, each].add(noise).reshape(2 * count, 2 * count)
-    lower = jnp.linalg.cholesky(0.5 * (innovation + innovation.T))
-    half = jax.scipy.linalg.solve_triangular(lower, gain.T, lower=True)
     off = jnp.where(used[:, None], measured - seen, 0.0).ravel()
-    change = half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True)
-    covariance = belief.covariance - half.T @ half
     depth = seen[:, 0]
     known = belief.heights[rows]
     share = known[:, 1] / (known[:, 1] + pixel_noise(depth, assumed))
     higher = height_of(frame.points, depth, assumed) - known[:, 0]
     heights = jnp.stack([known[:, 0] + share * higher, (1.0 - share) * known[:, 1]], axis=-1)
     counts = belief.counts.at[rows].add(1, mode="drop")
-    weight = jnp.maximum(1.0 / counts[rows], LEAST_WEIGHT)[:, None]
-    return belief._replace(
-        robots=belief.robots + change[:first].reshape(-1, ROBOT), places=belief.places + change[first:].reshape(-1, 2),
-        covariance=0.5 * (covariance + covariance.T), heights=belief.heights.at[rows].set(heights, mode="drop"),
-        looks=belief.looks.at[rows].add(weight * (frame.looks - belief.looks[rows]), mode="drop"), counts=counts,
+    change = jnp.maximum(1.0 / counts[rows], LEAST_WEIGHT)[:, None] * (frame.descriptors - belief.descriptors[rows])
+    return conditioned(belief, gain, innovation, off)._replace(
+        heights=belief.heights.at[rows].set(heights, mode="drop"),
+        descriptors=belief.descriptors.at[rows].add(change, mode="drop"), counts=counts,
     )  # fmt: skip
+
+
+def conditioned(belief: Belief, gain: Array, innovation: Array, off: Array) -> Belief:
+    """Return the belief given m numbers that are linear in its variables.
+
+    The covariance stays symmetric to the last bit: a difference of its halves would grow by itself.
+
+    Args:
+        gain: (n, m). Covariance of the variables with the numbers, P H^T.
+        innovation: (m, m). Covariance of the numbers with their noise, H P H^T + R.
+        off: (m,). Differences of the numbers read from those expected.
+    """
+    lower = jnp.linalg.cholesky(0.5 * (innovation + innovation.T))
+    half = jax.scipy.linalg.solve_triangular(lower, gain.T, lower=True)
+    change = half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True)
+    covariance, first = belief.covariance - half.T @ half, belief.first_place
+    return belief._replace(
+        robots=belief.robots + change[:first].reshape(-1, ROBOT),
+        places=belief.places + change[first:].reshape(-1, 2),
+        covariance=0.5 * (covariance + covariance.T),
+    )
 
 
 def insert(belief: Belief, robot: Array, frame: Frame, new: Array, assumed: Assumed) -> Belief:
@@ -295,11 +322,10 @@ def insert(belief: Belief, robot: Array, frame: Frame, new: Array, assumed: Assu
     free = jnp.nonzero(belief.counts == 0, size=len(new), fill_value=total)[0]
     rows = jnp.where(new, free[jnp.cumsum(new) - 1], total)
     pose = belief.robots[robot]
-    seen = jnp.stack([frame.points[:, 2], -frame.points[:, 0]], axis=-1)
+    seen = in_plane(frame.points)
     places = jax.vmap(place_of, (None, 0, None))(pose, seen, assumed)
     by_pose, by_seen = jax.vmap(jax.jacfwd(place_of, (0, 1)), (None, 0, None))(pose, seen, assumed)
-    own = jax.lax.dynamic_slice(belief.covariance, (ROBOT * robot, 0), (ROBOT, len(belief.covariance)))
-    corner = jax.lax.dynamic_slice(own, (0, ROBOT * robot), (ROBOT, ROBOT))
+    own, corner = _of_robot(belief, robot)
     noise = jax.vmap(sight_noise, (0, None))(seen, assumed)
     among = jnp.einsum("ria,ab,sjb->risj", by_pose, corner, by_pose)
     each = jnp.arange(len(new))
@@ -313,8 +339,9 @@ def insert(belief: Belief, robot: Array, frame: Frame, new: Array, assumed: Assu
     return belief._replace(
         places=belief.places.at[rows].set(places, mode="drop"), covariance=covariance,
         heights=belief.heights.at[rows].set(heights, mode="drop"),
-        looks=belief.looks.at[rows].set(frame.looks, mode="drop"), counts=belief.counts.at[rows].set(1, mode="drop"),
-        names=belief.names.at[rows].set(frame.names, mode="drop"),
+        descriptors=belief.descriptors.at[rows].set(frame.descriptors, mode="drop"),
+        counts=belief.counts.at[rows].set(1, mode="drop"),
+        true_ids=belief.true_ids.at[rows].set(frame.true_ids, mode="drop"),
         owners=belief.owners.at[rows].set(belief.groups[robot], mode="drop"),
     )  # fmt: skip
 

@@ -1,10 +1,9 @@
 """Merging of two groups within one Gaussian: the motion between their frames, and landmarks that both hold."""
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vslam_env.batched.belief import ROBOT, Belief
+from vslam_env.batched.belief import ROBOT, Belief, conditioned
 
 LOOSE = 10.0  # standard deviations of the alignment that are assumed of the motion before common landmarks tell it
 EQUAL = 1e-3  # [m] standard deviation of the difference of both copies of a landmark
@@ -82,20 +81,16 @@ def joined(
     gain = jnp.where(is_valid, moved.covariance[:, in_a] - moved.covariance[:, in_b], 0.0)  # P H^T, H = (1, -1)
     innovation = jnp.where(is_valid[:, None], gain[in_a] - gain[in_b], 0.0)
     innovation += jnp.diag(jnp.where(is_valid, EQUAL**2, 1.0))
-    lower = jnp.linalg.cholesky(0.5 * (innovation + innovation.T))
-    half = jax.scipy.linalg.solve_triangular(lower, gain.T, lower=True)
     off = jnp.where(valid[:, None], moved.places[pairs[:, 1]] - moved.places[pairs[:, 0]], 0.0).ravel()
-    change = half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True)
-    after = moved.covariance - half.T @ half
+    after = conditioned(moved, gain, innovation, off)
     free = jnp.zeros(rows, jnp.bool_).at[other].set(True, mode="drop")
     gone = jnp.concatenate([jnp.zeros(first, jnp.bool_), jnp.repeat(free, 2)])
-    after = jnp.where(gone[:, None] | gone, 0.0, 0.5 * (after + after.T))
     counts = moved.counts.at[kept].add(moved.counts[pairs[:, 1]], mode="drop")
     heights = moved.heights.at[kept].set(_fused(moved.heights, pairs), mode="drop")
-    return moved._replace(
-        robots=moved.robots + change[:first].reshape(-1, ROBOT), places=moved.places + change[first:].reshape(-1, 2),
-        covariance=after, counts=jnp.where(free, 0, counts), heights=heights,
-        owners=jnp.where(moved.owners == b, a, moved.owners), groups=jnp.where(moved.groups == b, a, moved.groups),
+    return after._replace(
+        covariance=jnp.where(gone[:, None] | gone, 0.0, after.covariance), heights=heights,
+        counts=jnp.where(free, 0, counts), owners=jnp.where(moved.owners == b, a, moved.owners),
+        groups=jnp.where(moved.groups == b, a, moved.groups),
     )  # fmt: skip
 
 

@@ -87,9 +87,9 @@ def test_robots_find_their_way_and_each_landmark_once() -> None:
     belief, (robots, _) = run(started(2, 96), readings.odometry, readings.frames, ASSUMED)
     errors = np.hypot(*np.moveaxis(np.asarray(robots)[..., :2] - readings.paths[..., :2], -1, 0))
     assert errors.max() < 0.15
-    counts, names, owners = (np.asarray(part) for part in (belief.counts, belief.names, belief.owners))
+    counts, true_ids, owners = (np.asarray(part) for part in (belief.counts, belief.true_ids, belief.owners))
     for robot in range(2):
-        held = names[(counts > 0) & (owners == robot)]
+        held = true_ids[(counts > 0) & (owners == robot)]
         assert len(held) == len(set(held.tolist())) > 30
     covariance = np.asarray(belief.covariance)
     np.testing.assert_array_equal(covariance, covariance.T)

@@ -22,9 +22,9 @@ def both_maps(seed: int) -> tuple[Any, Any]:
 
 def common(belief: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows (q, 2) of landmarks that both robots hold, padded, and which are valid."""
-    names, owners = np.asarray(belief.names), np.asarray(belief.owners)
+    true_ids, owners = np.asarray(belief.true_ids), np.asarray(belief.owners)
     held = np.asarray(belief.counts) > 0
-    sides = [{int(names[row]): row for row in np.flatnonzero(held & (owners == robot))} for robot in range(2)]
+    sides = [{int(true_ids[row]): row for row in np.flatnonzero(held & (owners == robot))} for robot in range(2)]
     pairs = [(sides[0][name], sides[1][name]) for name in sorted(sides[0].keys() & sides[1].keys())]
     padded = np.zeros((MOST_PAIRS, 2), np.int64)
     padded[: len(pairs)] = pairs
@@ -99,8 +99,8 @@ def test_merged_robots_share_one_map_and_go_on() -> None:
     standing = np.zeros_like(readings.odometry)
     still = jax.tree.map(lambda values: jnp.repeat(values[-1:], len(values), axis=0), readings.frames)
     after, (robots, _) = run(merged, standing, still, ASSUMED)
-    names, counts = np.asarray(after.names), np.asarray(after.counts)
-    assert len(names[counts > 0]) == len(set(names[counts > 0].tolist()))
+    true_ids, counts = np.asarray(after.true_ids), np.asarray(after.counts)
+    assert len(true_ids[counts > 0]) == len(set(true_ids[counts > 0].tolist()))
     errors = np.asarray(robots)[-1, :, :2] - readings.paths[-1, :, :2]
     assert np.hypot(*errors.T).max() < 0.15
 
