@@ -5,7 +5,8 @@ their points. Over short windows of a log the ratios of both motions are the sam
 axes are right, and equal to one; a mistake in the set-up changes them in a way of its own.
 
 No filter is needed, and none can be misled: matches are those of given identities, or of descriptors that are nearest
-to each other in both frames. Of a filter that ran already, matches are those that it found.
+to each other in both frames. Of a filter that ran already, matches are those that it found; its map also tells whether
+too few landmarks look different to find a lost robot by them.
 """
 
 import math
@@ -16,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.packed_symmetric import OF_NINE, UNPACK_INDEX
-from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error, check_array
 from slam_backend.geometry import rotation
+from slam_backend.maps.descriptor_matching import similar_pairs, similar_to_any
 from slam_backend.maps.match_table import COLUMNS, planar_points, planar_variances
 from slam_backend.maps.registration import MIN_VARIANCE, information, squared_distances
 from slam_backend.metrics import align_se2
@@ -25,6 +27,8 @@ from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.log_arrays import EXACT, LogArrays
+from slam_backend.smoother.reassociation import LandmarkTable
+from slam_backend.smoother.relocalisation import MIN_PAIRS, alignment_options, are_distinct
 
 WINDOW = 10  # longest window [steps]
 LEAST_WINDOWS = 20  # fewest windows for a diagnosis
@@ -43,11 +47,12 @@ NOISY = 10.0  # times the assumed standard deviation of odometry
 NOISY_POINTS = 14.0  # the same of points; drifting features of a car that pitches and rolls leave up to 13.5
 FITTING = 5.0  # the same; points beyond it do not judge the odometry's noise
 HALF_CHI_SQUARE, CHI_SQUARE_2 = 0.455, 1.386  # medians of chi-square with one degree of freedom and with two
+LOOK_ALIKES = "look-alikes"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cause:
-    """Likely mistake in the set-up of a log.
+    """Likely mistake in the set-up of a log, or what it cannot tell.
 
     Attributes:
         name: Key of `CAUSES`.
@@ -82,6 +87,8 @@ CAUSES = {  # what is said of each cause; `{ratio}` is what was found
     "noise, or check the association of the measurements.",
     "odometry noise": "Motions differ by {ratio:.0f} times their assumed standard deviation: assume more odometry "
     "noise, or check the time stamps.",
+    LOOK_ALIKES: "Nearly all landmarks look alike: that a robot is lost or was carried cannot be seen. Give distinct "
+    "descriptors, or identities.",
 }
 
 
@@ -141,8 +148,18 @@ def diagnose(
     return (_cause("delay", late),) if late else name_causes(found)
 
 
-def diagnose_run(log: LogArrays, camera: StereoCamera, motion: OdometryModel) -> tuple[Cause, ...]:
-    """Return the likely mistakes in the set-up of a filter's log of one robot, see `diagnose`; none of exact poses."""
+def diagnose_run(
+    log: LogArrays, camera: StereoCamera, motion: OdometryModel, known: LandmarkTable | None = None,
+    descriptor_gate: float = 0.0,
+) -> tuple[Cause, ...]:  # fmt: skip
+    """Return the likely mistakes in the set-up of a filter's log of one robot, see `diagnose`; none of exact poses.
+
+    Args:
+        log: Log of the robot.
+        camera, motion: See `diagnose`.
+        known: Landmarks of the filter, to see whether the robot's look alike. None: they have identities.
+        descriptor_gate: Largest L2 distance of similar descriptors.
+    """
     if not len(log) or (log.kinds == EXACT).any():
         return ()
     odometry = np.zeros((int(log.steps[-1]) + 1, 3))
@@ -156,7 +173,30 @@ def diagnose_run(log: LogArrays, camera: StereoCamera, motion: OdometryModel) ->
             spreads = ROBOT_FROM_CAMERA.T @ log.covariances[own][:, UNPACK_INDEX] @ ROBOT_FROM_CAMERA
         points = log.points[own] @ ROBOT_FROM_CAMERA
         frames[step], names[step] = Measurements(points, np.zeros((len(points), 1), np.float32), spreads), log.ids[own]
-    return diagnose(odometry, frames, names, camera, motion)
+    found = diagnose(odometry, frames, names, camera, motion)
+    return found if known is None else found + find_look_alikes(log, known, descriptor_gate)
+
+
+def find_look_alikes(log: LogArrays, known: LandmarkTable, descriptor_gate: float) -> tuple[Cause, ...]:
+    """Return whether too few landmarks tell where a robot is; nothing is said of small maps. See `diagnose_run`."""
+    seen = np.isin(known.ids, log.ids)
+    ids, looks = known.ids[seen], known.descriptors[seen]
+    distinct = are_distinct(looks, alignment_options(descriptor_gate))
+    if len(ids) < 2 * MIN_PAIRS or distinct.sum() >= MIN_PAIRS:
+        return ()
+    distinct |= ~similar_to_any(looks, looks[_seen_with_look_alikes(log, ids, looks, descriptor_gate)], descriptor_gate)
+    share = float(distinct.mean())
+    return () if distinct.sum() >= MIN_PAIRS else (_cause(LOOK_ALIKES, share),)
+
+
+def _seen_with_look_alikes(log: LogArrays, ids: IntArray, looks: Float32Array, gate: float) -> BoolArray:
+    """Return which landmarks (l,) one frame shows beside one that looks alike: that is no copy of the same one."""
+    result = np.zeros(len(ids), np.bool_)
+    for frame in np.split(log.ids, log.starts[1:-1]):
+        rows = np.flatnonzero(np.isin(ids, frame))
+        pairs = similar_pairs(looks[rows], looks[rows], gate, len(rows))
+        result[rows[pairs[pairs[:, 0] != pairs[:, 1], 0]]] = True
+    return result
 
 
 def find_delay(turns: FloatArray, found: Motions) -> int:

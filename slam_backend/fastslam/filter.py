@@ -49,7 +49,7 @@ from slam_backend.fastslam.particle_maps import (
     zeros_aligned,
 )
 from slam_backend.fastslam.pending_steps import LONGEST, PendingSteps, record_rejected
-from slam_backend.fastslam.rejuvenation import NewLandmarks, RejuvenationScheduler, check_rejected
+from slam_backend.fastslam.rejuvenation import NewLandmarks, RejuvenationScheduler, check_rejected, landmark_table
 from slam_backend.fastslam.relative_poses import TeamPoses, membership_table
 from slam_backend.fastslam.reports import (
     Associations,
@@ -590,9 +590,14 @@ class FastSlam:
         return self._consistency.report()
 
     def diagnose(self, robot: int = 0) -> tuple[Cause, ...]:
-        """Return the likely mistakes in the set-up of a robot's readings so far, by `slam_backend.diagnosis`."""
-        own = self.logs[self._check_robot(robot)].arrays()
-        return diagnose_run(own, self.options.camera, self.options.motion)
+        """Return the likely mistakes in the set-up of a robot's readings so far, by `slam_backend.diagnosis`.
+
+        Landmarks without identities that all look alike are said to be so, last.
+        """
+        own, options = self.logs[self._check_robot(robot)].arrays(), self.options
+        named = (self.maps.identities[self.maps.used_slots()] >= 0).any()
+        known = None if named else landmark_table(self.maps, self.best_particle)
+        return diagnose_run(own, options.camera, options.motion, known, options.descriptor_gate)
 
     def log(self, robot: int = 0) -> RobotLog:
         """Return a copy of a robot's log: odometry, measured points and their data association."""

@@ -14,7 +14,6 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.particle_maps import ParticleMaps, present_slots, write_summary
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import compose, inverse, rotate_covariances
-from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.landmark_map import MapSummaryRows
 from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, log_head
@@ -23,7 +22,7 @@ from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
 from slam_backend.smoother.rejuvenation import Draft, Particles, Rejuvenation, Smoother
-from slam_backend.smoother.relocalisation import MIN_PAIRS
+from slam_backend.smoother.relocalisation import alignment_options
 from slam_backend.smoother.sampling import PathLandmarks
 from slam_backend.state import MAX_INT, Dict, Each, Flag, Int, Maybe, Record, Sizes, State
 
@@ -312,7 +311,7 @@ class RejuvenationScheduler:
         if reason := self._why_disabled:
             self._restart_interval()
             return _failed(graph, reason)
-        alignment = AlignmentOptions(descriptor_gate=options.descriptor_gate, min_inliers=MIN_PAIRS)
+        alignment = alignment_options(options.descriptor_gate)
         smoother = Smoother(options.motion, camera, options.smoothing, rng, alignment)
         self._set_graph(graph)
         is_due = self.is_due  # before slices add the sightings that `effort` weighs

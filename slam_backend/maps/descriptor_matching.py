@@ -28,6 +28,14 @@ def count_similar(a: Float32Array, b: Float32Array, gate: float) -> int:
     return sum(int(np.count_nonzero(squares <= gate * gate)) for _, squares in squared_distances(a, b))
 
 
+def similar_to_any(a: Float32Array, b: Float32Array, gate: float) -> BoolArray:
+    """Return the mask (n,) of descriptors (n, d) within `gate` of at least one of others (m, d)."""
+    near = np.zeros(len(a), np.bool_)
+    for first, squares in squared_distances(a, b):
+        near[first : first + len(squares)] = (squares <= gate * gate).any(axis=1)
+    return near
+
+
 def similar_pairs(a: Float32Array, b: Float32Array, gate: float, most: int) -> IntArray:
     """Pair all descriptors within `gate`, except those with more than `most` partners.
 

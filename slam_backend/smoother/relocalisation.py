@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
-from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray
 from slam_backend.geometry import compose, rotation, wrap_angle
 from slam_backend.maps.alignment import align_maps
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
@@ -72,6 +72,21 @@ class _Sightings(NamedTuple):
 UNSEEN = -1
 
 
+def alignment_options(descriptor_gate: float) -> AlignmentOptions:
+    """Return the gates and limits with which robots are found, for landmarks that look alike within a gate."""
+    return AlignmentOptions(descriptor_gate=descriptor_gate, min_inliers=MIN_PAIRS)
+
+
+def are_distinct(looks: Float32Array, options: AlignmentOptions) -> BoolArray:
+    """Return which landmarks (l, d) look like few others: those by which a robot can be found."""
+    return np.bincount(_alike(looks, options)[:, 0], minlength=len(looks)) > 0
+
+
+def _alike(looks: Float32Array, options: AlignmentOptions) -> IntArray:
+    """Return the pairs (n, 2) of landmarks (l, d) that look alike, and like few others; each is like itself."""
+    return similar_pairs(looks, looks, options.descriptor_gate, options.max_similar + 1)
+
+
 def relocalise(
     graph: SlamGraph, mode: MapEstimate, known: LandmarkTable, options: AlignmentOptions
 ) -> Relocated | None:
@@ -87,8 +102,7 @@ def relocalise(
     if len(rows) < 2 * MIN_PAIRS:
         return None
     at = np.searchsorted(known.ids, graph.landmark_ids[rows])
-    looks = known.descriptors[at]
-    alike = similar_pairs(looks, looks, options.descriptor_gate, options.max_similar + 1)  # each is like itself
+    alike = _alike(known.descriptors[at], options)
     alike = alike[alike[:, 0] != alike[:, 1]]
     suspected = None
     for robot in range(len(graph.last_keys)) if len(alike) >= 2 * MIN_PAIRS else ():

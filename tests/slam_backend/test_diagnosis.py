@@ -1,20 +1,22 @@
 """Diagnosis of a log's set-up: usual mistakes are named, right logs are not blamed."""
 
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slam_backend.diagnosis import CAUSES, diagnose, find_motions
+from slam_backend.diagnosis import CAUSES, LOOK_ALIKES, diagnose, find_look_alikes, find_motions
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
+from slam_backend.smoother.log_arrays import ODOMETRY, LogArrays
+from slam_backend.smoother.reassociation import LandmarkTable
 from slam_backend.team.team import TeamSlam
 from studies import circle_world
-from studies.circle_world import MOTION, Mistake, circle_log
+from studies.circle_world import MOTION, CircleLog, Mistake, circle_log
 
 
 @pytest.mark.parametrize("by_names", [True, False])
@@ -33,13 +35,49 @@ def test_a_mistake_is_named_alone(mistake: Mistake, by_names: bool) -> None:
 def test_a_filter_names_the_mistakes_in_its_own_readings(mistake: Mistake) -> None:
     """With identities a filter says of its readings what is said of the log, in a team too."""
     log = circle_log(mistake, 500)
+    assert said_by_filters(log, log.measurements, log.identities) == ([] if mistake == "none" else [mistake])
+
+
+def said_by_filters(log: CircleLog, frames: list[Measurements], identities: list[Any] | None = None) -> list[str]:
+    """Return what a filter says of its readings; the team of a robot with them, and one without, says the same."""
     slam, team = FastSlam(motion=MOTION, seed=0), TeamSlam(2, seed=0, motion=MOTION)
-    for odometry, frame, names in zip(log.odometry, log.measurements, log.identities, strict=True):
+    for step, (odometry, frame) in enumerate(zip(log.odometry, frames, strict=True)):
+        names = None if identities is None else identities[step]
         slam.step([odometry], [frame], [names])
         team.step([None, odometry], [None, frame], identities=[None, names])
-    expected = [] if mistake == "none" else [mistake]
-    assert [cause.name for cause in slam.diagnose()] == [cause.name for cause in team.diagnose(1)] == expected
     assert team.diagnose(0) == ()
+    said = [cause.name for cause in slam.diagnose()]
+    assert [cause.name for cause in team.diagnose(1)] == said
+    return said
+
+
+def test_filters_say_that_look_alikes_do_not_tell_where_a_robot_is() -> None:
+    """That is said of landmarks that all look alike and have no identities, not of a few, nor of different ones."""
+    log = circle_log("none", 500)
+    alike = [Measurements(frame.points, np.ones_like(frame.descriptors)) for frame in log.measurements]
+    assert said_by_filters(log, alike) == [LOOK_ALIKES]
+    assert said_by_filters(log, alike, log.identities) == []
+    assert said_by_filters(log, log.measurements) == []
+    for count in (0, 1):
+        few = [Measurements(frame.points[:count], frame.descriptors[:count]) for frame in alike]
+        assert LOOK_ALIKES not in said_by_filters(log, few)
+
+
+@given(st.integers(0, 20), st.integers(0, 20), st.booleans())
+def test_look_alikes_are_many_and_seen_together(alike: int, distinct: int, together: bool) -> None:
+    """Landmarks of one frame that look like more than six others are look-alikes; copies of one are never together."""
+    count = alike + distinct
+    looks = np.eye(21, dtype=np.float32)[np.r_[np.zeros(alike, np.int64), 1 : distinct + 1]]
+    known = LandmarkTable(np.arange(count), np.zeros((count, 3)), np.zeros((count, 6)), np.ones(count, np.int32), looks)
+    frames = min(count, 1) if together else count
+    log = LogArrays(
+        steps=np.arange(frames), kinds=np.full(frames, ODOMETRY, np.int8), motions=np.zeros((frames, 3)),
+        given=np.zeros(frames, np.bool_), starts=np.linspace(0, count, frames + 1).astype(np.int64),
+        points=np.zeros((count, 3)), ids=np.arange(count), covariances=None,
+    )  # fmt: skip
+    said = [(cause.name, cause.ratio) for cause in find_look_alikes(log, known, descriptor_gate=0.45)]
+    expected = together and count >= 10 and alike > 7 and distinct < 5
+    assert said == ([(LOOK_ALIKES, distinct / count)] if expected else [])
 
 
 def test_a_filter_with_exact_poses_or_no_step_says_nothing() -> None:

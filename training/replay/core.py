@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
-from slam_backend.diagnosis import Cause, diagnose
+from slam_backend.diagnosis import LOOK_ALIKES, Cause, diagnose
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import PoseEstimate, RejuvenationReport
@@ -86,7 +86,7 @@ class Replay:
     measurements: Mapping[str, int]
     rejuvenations: Mapping[str, Any]  # Rejuvenations of all filters, see `RejuvenationCount.to_mapping`
     consistency: tuple[Consistency, ...]  # Consistency of each robot's filter at the end
-    causes: tuple[tuple[Cause, ...], ...]  # Likely mistakes in the set-up of each robot's log
+    causes: tuple[tuple[Cause, ...], ...]  # Likely mistakes in the set-up of each robot's log, and look-alikes
     seconds: float  # Computing time of the filters [s]
 
     @property
@@ -136,6 +136,10 @@ class SingleFilter:
     def consistency(self, robot: int) -> Consistency:
         """Return the consistency of the filter."""
         return self.filter.consistency
+
+    def diagnose(self, robot: int) -> tuple[Cause, ...]:
+        """Return what the filter says of the readings."""
+        return self.filter.diagnose()
 
 
 def make_filters(log: Log, config: ReplayConfig) -> "TeamSlam | SingleFilter":
@@ -231,7 +235,11 @@ def replay_log(
     ]
     noise = {name: log.options[name] for name in ("camera", "motion") if name in log.options}
     named = [robot.identities[:num_steps] if log.identified and robot.identities else None for robot in log.robots]
-    causes = [diagnose(odometry[robot], seen[robot], named[robot], **noise) for robot in robots]
+    causes = [
+        diagnose(odometry[robot], seen[robot], named[robot], **noise)
+        + tuple(cause for cause in team.diagnose(robot) if cause.name == LOOK_ALIKES)
+        for robot in robots
+    ]
     return Replay(
         times=times, paths=paths, reckoned=np.array(reckoned), stages=tuple(stages), groups=team.groups,
         maps=tuple(own.moved(frame) for own, frame in zip(maps, frames_of, strict=True)),
