@@ -45,6 +45,8 @@ def run(folder: Path, picture: Path) -> dict[str, AteResult]:
     for k, (moved, frame) in enumerate(zip(steps.odometry, steps.measurements, strict=True)):
         slam.step([moved if k else None], [frame])
         path[k] = slam.pose().mean
+    for cause in slam.diagnose():
+        print(f"{cause.name}: {cause.text}")
     places = slam.map().means[:, :2]
     names = steps.names[slam.map().descriptors.argmax(axis=1)]
 

@@ -86,7 +86,7 @@ CAUSES = {  # what is said of each cause; `{ratio}` is what was found
     "measurement noise": "Points differ by {ratio:.0f} times their assumed standard deviation: assume more measurement "
     "noise, or check the association of the measurements.",
     "odometry noise": "Motions differ by {ratio:.0f} times their assumed standard deviation: assume more odometry "
-    "noise, or check the time stamps.",
+    "noise, or check time stamps and units: turns are radians.",
     LOOK_ALIKES: "Nearly all landmarks look alike: that a robot is lost or was carried cannot be seen. Give distinct "
     "descriptors, or identities.",
 }
@@ -325,11 +325,14 @@ def name_causes(found: Motions) -> tuple[Cause, ...]:
         causes.append(_cause("rotated axes", math.degrees(direction)))
     elif opposite:
         causes.append(_cause("sign of turns", -1.0))
+    causes += _of_turns(abs(turn), turn_error, turn_spread)
+    if max(np.abs(np.exp(1j * (turns - sign * sighted_turns)).mean()) for sign in (1.0, -1.0)) < AGREED:
+        causes = [cause for cause in causes if cause.name == "odometry in degrees"]  # turns tell of no axis
     fit = math.sqrt(float(np.median(found.fits)))
     variances = turn**2 * found.variances[:, 1] + max(1.0, fit**2) * found.covariances[:, 2, 2]
     rest = (sighted_turns - turn * turns) ** 2 / variances
     noise = math.sqrt(float(np.median(rest)) / HALF_CHI_SQUARE)
-    causes += _of_turns(abs(turn), turn_error, turn_spread) + _of_distances(length, length_error, length_spread)
+    causes += _of_distances(length, length_error, length_spread)
     if fit > NOISY_POINTS or noise > NOISY:  # readings that say little tell no scale
         causes = [cause for cause in causes if not cause.name.startswith("scale")]
     if fit > NOISY_POINTS and not causes:

@@ -31,6 +31,16 @@ def test_a_mistake_is_named_alone(mistake: Mistake, by_names: bool) -> None:
         assert {cause.name for cause in found} <= CAUSES.keys()
 
 
+@given(st.integers(0, 2**31))
+@settings(max_examples=20)
+def test_turns_without_rhyme_tell_of_no_axis(seed: int) -> None:
+    """Turns that agree with the sightings in neither sense, as degrees modulo full turns, blame no axis or scale."""
+    log, turns = circle_log("none", 500), np.random.default_rng(seed).uniform(-np.pi, np.pi, 300)
+    changed = np.column_stack([log.odometry[:, :2], turns[: len(log.odometry)]])
+    found = {cause.name for cause in diagnose(changed, log.measurements, log.identities, motion=MOTION)}
+    assert found <= {"odometry noise", "odometry in degrees"}
+
+
 @pytest.mark.parametrize("mistake", get_args(Mistake))
 def test_a_filter_names_the_mistakes_in_its_own_readings(mistake: Mistake) -> None:
     """With identities a filter says of its readings what is said of the log, in a team too."""
