@@ -24,7 +24,7 @@ MAX_ITERATIONS = 100
 FIRST_DAMPING = 1e-3  # from dead reckoning
 GIVEN_DAMPING = 1e-6  # from a given initial estimate
 LEAST_DAMPING, MAX_DAMPING = 1e-9, 1e12
-LEAST_DECREASE = 1e-12  # relative decrease of the cost at convergence
+LEAST_DECREASE = 1e-6  # relative decrease of the cost at convergence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +101,8 @@ def _descend(
         try:
             trial = system.moved(at, *system.solve(damping))
         except np.linalg.LinAlgError:  # outliers alone: the robust kernel leaves something without information
+            if not damping:
+                return at, system, iteration + 1
             damping = max(10.0 * damping, LEAST_DAMPING)
             continue
         changed = _System(problem, trial, problem.sights(trial, metric), robust)
@@ -113,8 +115,8 @@ def _descend(
                 damping = 0.0
             else:
                 return at, system, iteration + 1
-        elif damping <= FIRST_DAMPING and changed.cost - system.cost <= LEAST_DECREASE * (1.0 + system.cost):
-            return at, system, iteration + 1  # at the minimum: the cost rises by rounding alone
+        elif not damping:
+            return at, system, iteration + 1  # at the minimum but for directions with hardly any information
         else:
             damping = max(10.0 * damping, LEAST_DAMPING)
             if damping > MAX_DAMPING:
