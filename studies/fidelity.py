@@ -13,24 +13,24 @@ import numpy as np
 
 from slam_backend.core.blas import single_threaded_blas
 from slam_backend.core.validation import FloatArray
-from slam_backend.geometry import between
 from studies import losses
+from studies.bounds.episodes import RecordedEpisode, record_episode
+from studies.bounds.gaussian_team import check_jax, gaussian_team
 from training.bench.exploration.players import parted
 from training.commands.study import run_program
 from training.episodes.guard import GuardedTeam
-from training.episodes.runner import EpisodeRecord, run_episode
 from training.experiments.config import NoisePreset, RobotCount, option
 from training.experiments.study import Column, ResultTable, Row, Study
 from vslam_env import vslam_v1
 from vslam_env.belief.team_belief import Belief
-from vslam_env.config import EnvConfig
+from vslam_env.config import TICK, EnvConfig
 
 Estimator = Literal[
     "no smoother", "no smoother, 400 particles", "30 keyframes", "60 keyframes", "60 keyframes, 3 iterations",
-    "every 200 ticks", "10 particles", "1 particle",
+    "every 200 ticks", "10 particles", "1 particle", "one Gaussian",
 ]  # fmt: skip
 FEW: dict[str, Any] = {"further_keys": 0, "steps_per_key": 10**6, "landmarks_per_key": 10**6, "closure_after": 0}
-OPTIONS: Mapping[Estimator, Mapping[str, Any]] = {  # of the filters
+OPTIONS: Mapping[str, Mapping[str, Any]] = {  # of the filters; "one Gaussian" is no filter
     "no smoother": {"rejuvenate_every": None},
     "no smoother, 400 particles": {"rejuvenate_every": None, "num_particles": 400},
     "30 keyframes": {"smoothing": FEW | {"max_keys": 30, "recent_keys": 15}},
@@ -58,6 +58,12 @@ class Config(losses.Config):
     )  # fmt: skip
     estimators: tuple[Estimator, ...] = option(get_args(Estimator), "Estimators to compare.", shown="all")
 
+    def check(self) -> None:
+        """Refuse what the episodes refuse, and a missing package."""
+        if "one Gaussian" in self.estimators:
+            check_jax()
+        super().check()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial(losses.Trial):
@@ -76,10 +82,9 @@ def trials(config: Config) -> list[Trial]:
 
 
 class Played(NamedTuple):
-    """An episode, the returns (K,) of its robots, and its actions by tick."""
+    """An episode, and its actions by tick."""
 
-    record: EpisodeRecord
-    returns: FloatArray
+    episode: RecordedEpisode
     actions: Sequence[Mapping[str, Any]]
 
 
@@ -121,14 +126,8 @@ def run(environment: EnvConfig, seed: int, policy: str, actions: Sequence[Mappin
             team: GuardedTeam = _Recorder(parted(policy).make(env, losses.LONGEST_DECISION))
         else:
             team = GuardedTeam(_Tape(actions), policy, environment.action_type)
-        returns = np.zeros(len(env.possible_agents))
-
-        def add(progress: Any) -> None:
-            if progress.rewards:
-                returns[:] += [progress.rewards[agent] for agent in env.possible_agents]
-
-        record = run_episode(env, team, seed, add)
-    return Played(record, returns, team.actions if isinstance(team, _Recorder) else actions or ())
+        episode = record_episode(env, team, seed)
+    return Played(episode, team.actions if isinstance(team, _Recorder) else actions or ())
 
 
 @lru_cache(maxsize=1)
@@ -150,36 +149,65 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     Raises:
         PolicyError: If the policy fails.
     """
-    environment = losses.environment(config, trial)
-    episode = {name: value for name, value in asdict(trial).items() if name != "estimator"}
-    whole = exact(config, losses.Trial(**episode))
-    changed = environment.replace(belief={"filter": dict(OPTIONS[trial.estimator])})
-    other = run(changed, trial.seed, trial.policy, whole.actions)
-    (a, a_ends), (b, b_ends) = (_scores(own.record) for own in (whole, other))
+    shared = {name: value for name, value in asdict(trial).items() if name != "estimator"}
+    whole = exact(config, losses.Trial(**shared))
+    a = _outcome(whole.episode)
+    if trial.estimator == "one Gaussian":
+        b = _gaussian_outcome(whole.episode)
+    else:
+        changed = losses.environment(config, trial).replace(belief={"filter": dict(OPTIONS[trial.estimator])})
+        b = _outcome(run(changed, trial.seed, trial.policy, whole.actions).episode)
     return {
-        "position_ratio": losses.ratio(b["position"], a["position"]), "map_ratio": losses.ratio(b["map"], a["map"]),
-        "recall_change": b["recall"] - a["recall"], "map_error_change": b["error"] - a["error"],
-        "own_returns": other.returns, "exact_returns": whole.returns, "delays": b_ends - a_ends,
-        "false_merges": _false(other.record), "exact_false_merges": _false(whole.record),
+        "position_ratio": losses.ratio(b.position, a.position), "map_ratio": losses.ratio(b.landmarks, a.landmarks),
+        "recall_change": b.recall - a.recall, "map_error_change": float(np.mean(b.last_errors - a.last_errors)),
+        "own_returns": b.first_errors - b.last_errors, "exact_returns": a.first_errors - a.last_errors,
+        "delays": b.merge_times - a.merge_times, "false_merges": b.false_merges, "exact_false_merges": a.false_merges,
     }  # fmt: skip
 
 
-def _scores(record: EpisodeRecord) -> tuple[dict[str, float], FloatArray]:
-    """Return errors of an episode, and the times of its K - 1 merges, the end for those that are missing."""
-    errors = record.estimated[..., :2] - between(record.true_poses[:, :1], record.true_poses)[..., :2]
-    kept = sorted(merge.time for merge in record.merges if merge.undone is None)
-    times = np.full(len(record.infos) - 1, record.times[-1])
-    times[: len(kept)] = kept[: len(times)]
-    scores = {
-        name: float(np.mean([float(info[key]) for info in record.infos]))
-        for name, key in (("map", "map_rmse"), ("recall", "map_recall"), ("error", "map_error"))
-    }
-    return scores | {"position": float(np.sqrt((errors**2).sum(axis=-1).mean()))}, times
+class _Outcome(NamedTuple):
+    """Errors of a team's poses and maps: RMS of positions [m], of landmarks [m], E (K,) [m], and K - 1 merges [s]."""
+
+    position: float
+    landmarks: float
+    recall: float
+    first_errors: FloatArray
+    last_errors: FloatArray
+    merge_times: FloatArray
+    false_merges: int
 
 
-def _false(record: EpisodeRecord) -> int:
-    """Return the number of false merges that were not undone."""
-    return sum(merge.is_false for merge in record.merges if merge.undone is None)
+def _outcome(episode: RecordedEpisode) -> _Outcome:
+    """Return the errors of the environment's estimator."""
+    record = episode.record
+    kept = [merge for merge in record.merges if merge.undone is None]
+    landmarks, recall = (float(np.mean([float(i[key]) for i in record.infos])) for key in ("map_rmse", "map_recall"))
+    return _Outcome(
+        _position(record.estimated, episode), landmarks, recall, record.map_errors[:, 0], record.map_errors[:, -1],
+        _padded([merge.time for merge in kept], episode), sum(merge.is_false for merge in kept),
+    )  # fmt: skip
+
+
+def _gaussian_outcome(episode: RecordedEpisode) -> _Outcome:
+    """Return the errors of the Gaussian belief on the same readings."""
+    team = gaussian_team(episode)
+    first, last = team.map_errors.T
+    return _Outcome(
+        _position(team.paths, episode), float(team.map_rmses.mean()), float(team.map_recalls.mean()), first, last,
+        _padded([TICK * tick for tick in team.merges], episode), team.false_merges,
+    )  # fmt: skip
+
+
+def _position(paths: FloatArray, episode: RecordedEpisode) -> float:
+    """Return the RMS position error [m] of paths (K, T, 3) in start frames."""
+    return float(np.sqrt((losses.errors_of(paths, episode)[..., :2] ** 2).sum(axis=-1).mean()))
+
+
+def _padded(times: Sequence[float], episode: RecordedEpisode) -> FloatArray:
+    """Return the times of K - 1 merges, the end of the episode for those that are missing."""
+    result = np.full(len(episode.true_paths) - 1, episode.record.times[-1])
+    result[: len(times)] = sorted(times)[: len(result)]
+    return result
 
 
 # ---------------------------------------------------------------------- results

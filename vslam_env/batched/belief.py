@@ -15,8 +15,10 @@ from jax import Array
 
 from slam_backend.fastslam.options import FilterOptions
 
-ROBOT = 5  # variables of a robot: pose (3) [m, m, rad], relative bias of distances, bias of turns [rad/m]
+ROBOT = 8  # variables of a robot: pose (3) [m, m, rad], relative bias of distances, bias of turns [rad/m], start (3)
+START = 5  # first variable of the start among these
 NEAREST = 0.3  # [m] noise is that of points at least so far ahead
+ROUNDING = 0.003  # [m] standard deviation that is added to sights: beside variances of square metres float32 needs it
 LEAST_WEIGHT = 0.1  # of a new measurement in the mean descriptor of a landmark
 
 
@@ -72,10 +74,10 @@ class Frame(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """Gaussian over K robots and R rows of landmarks, with n = 5 K + 2 R variables in this order.
+    """Gaussian over K robots and R rows of landmarks, with n = 8 K + 2 R variables in this order.
 
     Attributes:
-        robots: (K, 5) float32. Poses [m, m, rad], map frame of the robot's group, and odometry biases.
+        robots: (K, 8) float32. Poses [m, m, rad], map frame of the robot's group, odometry biases, and start poses.
         places: (R, 2) float32 [m], map frame of the group.
         covariance: (n, n) float32, symmetric.
         heights: (R, 2) float32 [m, m^2]. Height of each landmark above the floor, and its variance.
@@ -104,7 +106,8 @@ class Belief(NamedTuple):
 
 def start(num_robots: int, rows: int, size: int, assumed: Assumed) -> Belief:
     """Return the belief of robots at their starts, with room for R landmarks with descriptors of a size."""
-    variances = jnp.tile(jnp.array([0.0, 0.0, 0.0, assumed.bias_scale**2, assumed.bias_heading**2]), num_robots)
+    of_robot = jnp.zeros(ROBOT).at[3].set(assumed.bias_scale**2).at[4].set(assumed.bias_heading**2)
+    variances = jnp.tile(of_robot, num_robots)
     return Belief(
         robots=jnp.zeros((num_robots, ROBOT)), places=jnp.zeros((rows, 2)),
         covariance=jnp.diag(jnp.concatenate([variances, jnp.zeros(2 * rows)])), heights=jnp.zeros((rows, 2)),
@@ -117,8 +120,8 @@ def start(num_robots: int, rows: int, size: int, assumed: Assumed) -> Belief:
 
 
 def moved(robot: Array, odometry: Array) -> Array:
-    """Return a robot (5,) after a reading (3,) [m, m, rad], whose error by the biases is taken off."""
-    x, y, heading, scale, turn_per_metre = robot
+    """Return a robot (8,) after a reading (3,) [m, m, rad], whose error by the biases is taken off."""
+    x, y, heading, scale, turn_per_metre = robot[:5]
     dx, dy, turn = odometry
     late = turn_per_metre * distance_of(odometry)
     ahead, aside = dx - scale * dx + 0.5 * dy * late, dy - scale * dy - 0.5 * dx * late
@@ -133,7 +136,7 @@ def distance_of(odometry: Array) -> Array:
 
 
 def motion_noise(heading: Array, odometry: Array, assumed: Assumed) -> Array:
-    """Return the covariance (5, 5) that a reading adds to a robot, see `OdometryModel.variances`."""
+    """Return the covariance (8, 8) that a reading adds to a robot, see `OdometryModel.variances`."""
     dx, dy, turn = odometry
     square = dx**2 + dy**2
     along, across = (
@@ -164,7 +167,7 @@ def predict(belief: Belief, odometry: Array, assumed: Assumed) -> Belief:
 
 
 def seen_from(robot: Array, place: Array, assumed: Assumed) -> Array:
-    """Return where a robot (5,) sees a place (2,): (ahead, left) of its camera [m]."""
+    """Return where a robot (8,) sees a place (2,): (ahead, left) of its camera [m]."""
     dx, dy = place[0] - robot[0], place[1] - robot[1]
     c, s = jnp.cos(robot[2]), jnp.sin(robot[2])
     return jnp.stack([c * dx + s * dy - assumed.mount[0], c * dy - s * dx - assumed.mount[1]])
@@ -176,7 +179,7 @@ def in_plane(points: Array) -> Array:
 
 
 def place_of(robot: Array, seen: Array, assumed: Assumed) -> Array:
-    """Return the place (2,) that a robot (5,) sees at (ahead, left) of its camera [m]: the inverse of `seen_from`."""
+    """Return the place (2,) that a robot (8,) sees at (ahead, left) of its camera [m]: the inverse of `seen_from`."""
     ahead, left = seen[0] + assumed.mount[0], seen[1] + assumed.mount[1]
     c, s = jnp.cos(robot[2]), jnp.sin(robot[2])
     return jnp.stack([robot[0] + c * ahead - s * left, robot[1] + s * ahead + c * left])
@@ -187,7 +190,7 @@ def sight_noise(seen: Array, assumed: Assumed) -> Array:
     depth = jnp.maximum(seen[0], NEAREST)
     ray = jnp.stack([depth, seen[1]])
     along = (assumed.sigma_disparity * depth / (assumed.focal * assumed.baseline)) ** 2
-    return (along * jnp.outer(ray, ray)).at[1, 1].add(pixel_noise(depth, assumed))
+    return along * jnp.outer(ray, ray) + jnp.diag(jnp.stack([0.0, pixel_noise(depth, assumed)]) + ROUNDING**2)
 
 
 def pixel_noise(depth: Array, assumed: Assumed) -> Array:
@@ -198,12 +201,6 @@ def pixel_noise(depth: Array, assumed: Assumed) -> Array:
 def height_of(points: Array, depth: Array, assumed: Assumed) -> Array:
     """Return the heights above the floor [m] of points (..., 3), camera frame, at given depths."""
     return assumed.mount[2] - points[..., 1] / points[..., 2] * depth
-
-
-def _of_robot(belief: Belief, robot: Array) -> tuple[Array, Array]:
-    """Return the covariances of a robot with all variables (5, n), and with itself (5, 5)."""
-    own = jax.lax.dynamic_slice(belief.covariance, (ROBOT * robot, 0), (ROBOT, len(belief.covariance)))
-    return own, jax.lax.dynamic_slice(own, (0, ROBOT * robot), (ROBOT, ROBOT))
 
 
 class _Matches(NamedTuple):
@@ -224,7 +221,8 @@ def match(belief: Belief, robot: Array, frame: Frame, assumed: Assumed) -> _Matc
     seen = jax.vmap(seen_from, (None, 0, None))(pose, place, assumed)
     by_pose, by_place = jax.vmap(jax.jacfwd(seen_from, (0, 1)), (None, 0, None))(pose, place, assumed)
     first = belief.first_place
-    own, corner = _of_robot(belief, robot)
+    own = jax.lax.dynamic_slice(belief.covariance, (ROBOT * robot, 0), (ROBOT, len(belief.covariance)))
+    corner = jax.lax.dynamic_slice(own, (0, ROBOT * robot), (ROBOT, ROBOT))
     cross = own[:, first:].reshape(ROBOT, rows, 2)
     blocks = belief.covariance[first:, first:].reshape(rows, 2, rows, 2)[jnp.arange(rows), :, jnp.arange(rows)]
     mixed = jnp.einsum("ria,arb,rjb->rij", by_pose, cross, by_place)
@@ -263,34 +261,39 @@ def match(belief: Belief, robot: Array, frame: Frame, assumed: Assumed) -> _Matc
     return _Matches(chosen, frame.valid & (chosen == rows) & ~near)
 
 
-def update(belief: Belief, robot: Array, frame: Frame, rows: Array, assumed: Assumed) -> Belief:
-    """Return the belief given the matched measurements of a robot; rows (B,) as in `match`."""
-    count, first = len(rows), belief.first_place
+def update(belief: Belief, frames: Frame, rows: Array, assumed: Assumed) -> Belief:
+    """Return the belief given the matched measurements of all robots; frames (K, B) and rows (K, B) as in `match`."""
+    count, first = rows.size, belief.first_place
+    robots, rows = jnp.repeat(jnp.arange(len(rows)), rows.shape[1]), rows.ravel()
     used = rows < len(belief.counts)
-    pose, places = belief.robots[robot], belief.places[rows]
+    frame = jax.tree.map(lambda values: values.reshape(count, *values.shape[2:]), frames)
+    pose, places = belief.robots[robots], belief.places[rows]
     measured = in_plane(frame.points)
-    seen = jax.vmap(seen_from, (None, 0, None))(pose, places, assumed)
-    by_pose, by_place = jax.vmap(jax.jacfwd(seen_from, (0, 1)), (None, 0, None))(pose, places, assumed)
+    seen = jax.vmap(seen_from, (0, 0, None))(pose, places, assumed)
+    by_pose, by_place = jax.vmap(jax.jacfwd(seen_from, (0, 1)), (0, 0, None))(pose, places, assumed)
     by_pose, by_place = (jnp.where(used[:, None, None], by, 0.0) for by in (by_pose, by_place))
-    columns = jnp.concatenate([ROBOT * robot + jnp.arange(ROBOT), (first + 2 * rows[:, None] + jnp.arange(2)).ravel()])
-    each = jnp.arange(count)
-    jacobian = jnp.zeros((count, 2, ROBOT + 2 * count)).at[:, :, :ROBOT].set(by_pose)
-    jacobian = jacobian.at[each[:, None], :, ROBOT + 2 * each[:, None] + jnp.arange(2)].set(by_place.swapaxes(1, 2))
+    columns = jnp.concatenate([jnp.arange(first), (first + 2 * rows[:, None] + jnp.arange(2)).ravel()])
+    each = jnp.arange(count)[:, None]
+    jacobian = jnp.zeros((count, 2, first + 2 * count))
+    jacobian = jacobian.at[each, :, ROBOT * robots[:, None] + jnp.arange(ROBOT)].set(by_pose.swapaxes(1, 2))
+    jacobian = jacobian.at[each, :, first + 2 * each + jnp.arange(2)].set(by_place.swapaxes(1, 2))
     jacobian = jacobian.reshape(2 * count, -1)
-    gain = belief.covariance[:, columns] @ jacobian.T  # (n, 2 B); columns beyond the last are those of no match
+    gain = belief.covariance[:, columns] @ jacobian.T  # (n, 2 K B); columns beyond the last are those of no match
     noise = jnp.where(used[:, None, None], jax.vmap(sight_noise, (0, None))(seen, assumed), jnp.eye(2))
     innovation = jacobian @ gain[columns]
+    each = each[:, 0]
     innovation = innovation.reshape(count, 2, count, 2).at[each, :, each].add(noise).reshape(2 * count, 2 * count)
     off = jnp.where(used[:, None], measured - seen, 0.0).ravel()
-    depth = seen[:, 0]
-    known = belief.heights[rows]
-    share = known[:, 1] / (known[:, 1] + pixel_noise(depth, assumed))
-    higher = height_of(frame.points, depth, assumed) - known[:, 0]
-    heights = jnp.stack([known[:, 0] + share * higher, (1.0 - share) * known[:, 1]], axis=-1)
+    depth, known = seen[:, 0], belief.heights
+    precision = 1.0 / pixel_noise(depth, assumed)
+    told = jnp.stack([precision * height_of(frame.points, depth, assumed), precision], axis=-1)
+    before = jnp.stack([known[:, 0], jnp.ones_like(known[:, 0])], axis=-1) / known[:, 1:]
+    total = before.at[rows].add(told, mode="drop")
     counts = belief.counts.at[rows].add(1, mode="drop")
     change = jnp.maximum(1.0 / counts[rows], LEAST_WEIGHT)[:, None] * (frame.descriptors - belief.descriptors[rows])
     return conditioned(belief, gain, innovation, off)._replace(
-        heights=belief.heights.at[rows].set(heights, mode="drop"),
+        heights=jnp.where(belief.counts[:, None] > 0, jnp.stack([total[:, 0], jnp.ones_like(total[:, 0])], -1), 0.0)
+        / jnp.where(belief.counts[:, None] > 0, total[:, 1:], 1.0),
         descriptors=belief.descriptors.at[rows].add(change, mode="drop"), counts=counts,
     )  # fmt: skip
 
@@ -298,7 +301,9 @@ def update(belief: Belief, robot: Array, frame: Frame, rows: Array, assumed: Ass
 def conditioned(belief: Belief, gain: Array, innovation: Array, off: Array) -> Belief:
     """Return the belief given m numbers that are linear in its variables.
 
-    The covariance stays symmetric to the last bit: a difference of its halves would grow by itself.
+    What turns with a robot's heading turns about the changed means as about those before: without that, filters become
+    sure of headings that nothing told them (T. Zhang, K. Wu, J. Song, S. Huang, G. Dissanayake: Convergence and
+    consistency analysis for a 3-D invariant-EKF SLAM. RA-L 2(2), 2017).
 
     Args:
         gain: (n, m). Covariance of the variables with the numbers, P H^T.
@@ -307,33 +312,50 @@ def conditioned(belief: Belief, gain: Array, innovation: Array, off: Array) -> B
     """
     lower = jnp.linalg.cholesky(0.5 * (innovation + innovation.T))
     half = jax.scipy.linalg.solve_triangular(lower, gain.T, lower=True)
-    change = half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True)
-    covariance, first = belief.covariance - half.T @ half, belief.first_place
+    change, first = half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True), belief.first_place
+    robots, places = change[:first].reshape(-1, ROBOT), change[first:].reshape(-1, 2)
+    count = len(robots)
+    each, headings = jnp.arange(count), ROBOT * jnp.arange(count) + 2
+    by_robots = jnp.zeros((count, count, ROBOT)).at[each, each, :2].set(_turned(robots[:, :2]))
+    by_places = jnp.where((belief.owners == each[:, None])[:, :, None], _turned(places), 0.0)
+    by = jnp.concatenate([by_robots.reshape(count, -1), by_places.reshape(count, -1)], axis=1)  # (K, n)
+    of_headings = belief.covariance[headings] - half[:, headings].T @ half
+    with_headings = of_headings + 0.5 * of_headings[:, headings] @ by
+    left, right = jnp.concatenate([half, by, with_headings]), jnp.concatenate([-half, with_headings, by])
     return belief._replace(
-        robots=belief.robots + change[:first].reshape(-1, ROBOT),
-        places=belief.places + change[first:].reshape(-1, 2),
-        covariance=0.5 * (covariance + covariance.T),
-    )
+        robots=belief.robots + robots, places=belief.places + places,
+        covariance=symmetric(belief.covariance + left.T @ right),
+    )  # fmt: skip
 
 
-def insert(belief: Belief, robot: Array, frame: Frame, new: Array, assumed: Assumed) -> Belief:
-    """Return the belief with new landmarks (B,), as long as rows are free."""
-    total, first = len(belief.counts), belief.first_place
-    free = jnp.nonzero(belief.counts == 0, size=len(new), fill_value=total)[0]
+def _turned(shifts: Array) -> Array:
+    """Return shifts (..., 2) turned to the left."""
+    return jnp.stack([-shifts[..., 1], shifts[..., 0]], axis=-1)
+
+
+def symmetric(covariance: Array) -> Array:
+    """Return a covariance that is symmetric to the last bit: a difference of its halves would grow by itself."""
+    return 0.5 * (covariance + covariance.T)
+
+
+def insert(belief: Belief, frames: Frame, new: Array, assumed: Assumed) -> Belief:
+    """Return the belief with new landmarks, measurements (K, B) of all robots, as long as rows are free."""
+    total, first, count = len(belief.counts), belief.first_place, new.size
+    robots, new = jnp.repeat(jnp.arange(len(new)), new.shape[1]), new.ravel()
+    frame = jax.tree.map(lambda values: values.reshape(count, *values.shape[2:]), frames)
+    free = jnp.nonzero(belief.counts == 0, size=count, fill_value=total)[0]
     rows = jnp.where(new, free[jnp.cumsum(new) - 1], total)
-    pose = belief.robots[robot]
-    seen = in_plane(frame.points)
-    places = jax.vmap(place_of, (None, 0, None))(pose, seen, assumed)
-    by_pose, by_seen = jax.vmap(jax.jacfwd(place_of, (0, 1)), (None, 0, None))(pose, seen, assumed)
-    own, corner = _of_robot(belief, robot)
-    noise = jax.vmap(sight_noise, (0, None))(seen, assumed)
-    among = jnp.einsum("ria,ab,sjb->risj", by_pose, corner, by_pose)
-    each = jnp.arange(len(new))
-    among = among.at[each, :, each].add(jnp.einsum("ria,rab,rjb->rij", by_seen, noise, by_seen))
+    pose, seen, each = belief.robots[robots], in_plane(frame.points), jnp.arange(count)
+    places = jax.vmap(place_of, (0, 0, None))(pose, seen, assumed)
+    by_pose, by_seen = jax.vmap(jax.jacfwd(place_of, (0, 1)), (0, 0, None))(pose, seen, assumed)
+    noise = jnp.einsum("ria,rab,rjb->rij", by_seen, jax.vmap(sight_noise, (0, None))(seen, assumed), by_seen)
+    jacobian = jnp.zeros((count, 2, first)).at[each[:, None], :, ROBOT * robots[:, None] + jnp.arange(ROBOT)]
+    jacobian = jacobian.set(by_pose.swapaxes(1, 2)).reshape(2 * count, first)
+    cross = jacobian @ belief.covariance[:first]
+    among = (cross[:, :first] @ jacobian.T).reshape(count, 2, count, 2).at[each, :, each].add(noise)
     at = jnp.where(new[:, None], first + 2 * rows[:, None] + jnp.arange(2), len(belief.covariance)).ravel()
-    cross = jnp.einsum("ria,an->rin", by_pose, own).reshape(2 * len(new), -1)
     covariance = belief.covariance.at[at].set(cross, mode="drop").at[:, at].set(cross.T, mode="drop")
-    covariance = covariance.at[at[:, None], at].set(among.reshape(2 * len(new), -1), mode="drop")
+    covariance = covariance.at[at[:, None], at].set(symmetric(among.reshape(2 * count, -1)), mode="drop")
     depth = frame.points[:, 2]
     heights = jnp.stack([height_of(frame.points, depth, assumed), pixel_noise(depth, assumed)], axis=-1)
     return belief._replace(
@@ -342,21 +364,14 @@ def insert(belief: Belief, robot: Array, frame: Frame, new: Array, assumed: Assu
         descriptors=belief.descriptors.at[rows].set(frame.descriptors, mode="drop"),
         counts=belief.counts.at[rows].set(1, mode="drop"),
         true_ids=belief.true_ids.at[rows].set(frame.true_ids, mode="drop"),
-        owners=belief.owners.at[rows].set(belief.groups[robot], mode="drop"),
+        owners=belief.owners.at[rows].set(belief.groups[robots], mode="drop"),
     )  # fmt: skip
 
 
 def observe(belief: Belief, frames: Frame, assumed: Assumed) -> Belief:
     """Return the belief given the frames of all robots, which have a first dimension K."""
-
-    def take(robot: int, so_far: Belief) -> Belief:
-        own = jax.tree.map(lambda values: values[robot], frames)
-        matches = match(so_far, jnp.asarray(robot), own, assumed)
-        updated = update(so_far, jnp.asarray(robot), own, matches.rows, assumed)
-        return insert(updated, jnp.asarray(robot), own, matches.new, assumed)
-
-    after: Belief = jax.lax.fori_loop(0, len(belief.robots), take, belief)
-    return after
+    matches = jax.vmap(match, (None, 0, 0, None))(belief, jnp.arange(len(belief.robots)), frames, assumed)
+    return insert(update(belief, frames, matches.rows, assumed), frames, matches.new, assumed)
 
 
 def step(belief: Belief, odometry: Array, frames: Frame, assumed: Assumed) -> Belief:

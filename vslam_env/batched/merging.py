@@ -1,96 +1,107 @@
-"""Merging of two groups within one Gaussian: the motion between their frames, and landmarks that both hold."""
+"""Merging of two groups within one Gaussian: the motion between their frames, and landmarks that are held twice."""
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vslam_env.batched.belief import ROBOT, Belief, conditioned
+from vslam_env.batched.belief import ROBOT, START, Belief, conditioned, symmetric
 
-LOOSE = 10.0  # standard deviations of the alignment that are assumed of the motion before common landmarks tell it
-EQUAL = 1e-3  # [m] standard deviation of the difference of both copies of a landmark
+EQUAL = 1e-2  # [m] standard deviation of the difference of both copies of a landmark; float32 needs as much
 
 
-def moved_group(belief: Belief, group: Array, motion: Array, covariance: Array) -> Belief:
+def moved_group(belief: Belief, group: Array, motion: Array) -> Belief:
     """Return the belief with a group in another frame, p' = R(theta) p + t.
 
     Args:
         group: () int32. First robot of the group.
         motion: (3,) [m, m, rad]. Motion (tx, ty, theta) from the group's frame to the new one.
-        covariance: (3, 3). Covariance of the motion, which is independent of all else.
     """
     x, y, turn = motion
     c, s = jnp.cos(turn), jnp.sin(turn)
-    rotation = jnp.array([[c, -s], [s, c]])
+    rotation, shift = jnp.array([[c, -s], [s, c]]), jnp.stack([x, y])
     robots = belief.groups == group
     rows = (belief.owners == group) & (belief.counts > 0)
-    positions = belief.robots[:, :2] @ rotation.T
-    places = belief.places @ rotation.T
-    poses = jnp.concatenate([positions + jnp.stack([x, y]), belief.robots[:, 2:3] + turn, belief.robots[:, 3:]], axis=1)
-    of_robot = jnp.eye(ROBOT).at[:2, :2].set(rotation)
+    of_robot, turned = jnp.eye(ROBOT), belief.robots
+    for first in (0, START):  # its pose and its start
+        at = slice(first, first + 2)
+        of_robot = of_robot.at[at, at].set(rotation)
+        turned = turned.at[:, at].set(belief.robots[:, at] @ rotation.T + shift).at[:, first + 2].add(turn)
     by_robots = jnp.where(robots[:, None, None], of_robot, jnp.eye(ROBOT))
     by_places = jnp.where(rows[:, None, None], rotation, jnp.eye(2))
     half = _rotated(belief.covariance, by_robots, by_places)
-    turned = _rotated(half.T, by_robots, by_places)
-    lever = jnp.concatenate([_lever(positions, robots, ROBOT).reshape(-1, 3), _lever(places, rows, 2).reshape(-1, 3)])
-    spread = lever @ covariance @ lever.T
+    moved = _rotated(half.T, by_robots, by_places)
     return belief._replace(
-        robots=jnp.where(robots[:, None], poses, belief.robots),
-        places=jnp.where(rows[:, None], places + jnp.stack([x, y]), belief.places),
-        covariance=0.5 * (turned + turned.T) + 0.5 * (spread + spread.T),
+        robots=jnp.where(robots[:, None], turned, belief.robots),
+        places=jnp.where(rows[:, None], belief.places @ rotation.T + shift, belief.places),
+        covariance=symmetric(moved),
     )
 
 
+def lever_of(belief: Belief, group: Array, centre: Array) -> Array:
+    """Return the derivatives (n, 3) of all variables by a group's motion: a shift, and a turn about a centre (2,)."""
+    robots = jnp.zeros((len(belief.groups), ROBOT, 3))
+    for first in (0, START):
+        robots = robots.at[:, first : first + 2].set(_lever(belief.robots[:, first : first + 2] - centre))
+        robots = robots.at[:, first + 2, 2].set(1.0)
+    of_robots = jnp.where((belief.groups == group)[:, None, None], robots, 0.0)
+    rows = (belief.owners == group) & (belief.counts > 0)
+    of_places = jnp.where(rows[:, None, None], _lever(belief.places - centre), 0.0)
+    return jnp.concatenate([of_robots.reshape(-1, 3), of_places.reshape(-1, 3)])
+
+
+def _lever(away: Array) -> Array:
+    """Return the derivatives (m, 2, 3) of positions (m, 2), from the centre, by a motion."""
+    by = jnp.zeros((len(away), 2, 3)).at[:, 0, 0].set(1.0).at[:, 1, 1].set(1.0)
+    return by.at[:, 0, 2].set(-away[:, 1]).at[:, 1, 2].set(away[:, 0])
+
+
 def _rotated(matrix: Array, by_robots: Array, by_places: Array) -> Array:
-    """Return J M for a block-diagonal J with blocks (K, 5, 5) and (R, 2, 2)."""
+    """Return J M for a block-diagonal J with blocks (K, 8, 8) and (R, 2, 2)."""
     first, columns = by_robots.shape[0] * ROBOT, matrix.shape[1]
     robots = jnp.einsum("kij,kjn->kin", by_robots, matrix[:first].reshape(-1, ROBOT, columns))
     places = jnp.einsum("rij,rjn->rin", by_places, matrix[first:].reshape(-1, 2, columns))
     return jnp.concatenate([robots.reshape(-1, columns), places.reshape(-1, columns)])
 
 
-def _lever(rotated: Array, used: Array, size: int) -> Array:
-    """Return the derivatives (m, size, 3) by a motion of variables that begin with rotated positions (m, 2)."""
-    by = jnp.zeros((len(rotated), size, 3)).at[:, 0, 0].set(1.0).at[:, 1, 1].set(1.0)
-    by = by.at[:, 0, 2].set(-rotated[:, 1]).at[:, 1, 2].set(rotated[:, 0])
-    if size == ROBOT:
-        by = by.at[:, 2, 2].set(1.0)
-    return jnp.where(used[:, None, None], by, 0.0)
+def fused(belief: Belief, pairs: Array, valid: Array, lever: Array) -> Belief:
+    """Return the belief with both copies of landmarks as one; the rows of the second copies become free.
 
+    If a group has been moved to the frame of another one, the motion is unknown but for what the copies tell: its prior
+    is flat, so that nothing is counted twice. Given the motion this is conditioning, and what the copies tell of it
+    comes on top:
 
-def joined(
-    belief: Belief, a: Array, b: Array, motion: Array, covariance: Array, pairs: Array, valid: Array
-) -> Belief:  # fmt: skip
-    """Return the belief with group b in the frame of group a, and both copies of each common landmark as one.
-
-    The alignment serves as point of linearisation, with hardly any weight of its own: what is known of the motion is
-    what the copies tell, so that nothing is counted twice. Rows of b's copies become free.
+        y = H x - L m,  W = (H P H^T + R)^-1,  m = -(L^T W L)^-1 L^T W y.
 
     Args:
-        a, b: () int32. First robots of both groups.
-        motion: (3,) [m, m, rad]. Motion from frame b to frame a, by an alignment of both maps.
-        covariance: (3, 3). Covariance of the motion.
-        pairs: (q, 2) int32. Rows of landmarks of a and of b, one-to-one.
+        pairs: (q, 2) int32. Rows of the copies, in one frame, one-to-one.
         valid: (q,) bool. Pairs that count.
+        lever: (n, 3). Derivatives of the variables by the unknown motion, see `lever_of`; zeros without one.
     """
-    rows = len(belief.counts)
-    moved = moved_group(belief, b, motion, LOOSE**2 * covariance)
+    rows, first = len(belief.counts), belief.first_place
     kept, other = (jnp.where(valid, column, rows) for column in pairs.T)
-    first = belief.first_place
-    columns = [first + 2 * column[:, None] + jnp.arange(2) for column in (kept, other)]
-    in_a, in_b = (jnp.where(valid[:, None], column, 0).ravel() for column in columns)
     is_valid = jnp.repeat(valid, 2)
-    gain = jnp.where(is_valid, moved.covariance[:, in_a] - moved.covariance[:, in_b], 0.0)  # P H^T, H = (1, -1)
+    in_a, in_b = (jnp.where(is_valid, (first + 2 * column[:, None] + jnp.arange(2)).ravel(), 0) for column in pairs.T)
+    gain = jnp.where(is_valid, belief.covariance[:, in_a] - belief.covariance[:, in_b], 0.0)  # P H^T, H = (1, -1)
     innovation = jnp.where(is_valid[:, None], gain[in_a] - gain[in_b], 0.0)
     innovation += jnp.diag(jnp.where(is_valid, EQUAL**2, 1.0))
-    off = jnp.where(valid[:, None], moved.places[pairs[:, 1]] - moved.places[pairs[:, 0]], 0.0).ravel()
-    after = conditioned(moved, gain, innovation, off)
+    off = jnp.where(valid[:, None], belief.places[pairs[:, 1]] - belief.places[pairs[:, 0]], 0.0).ravel()
+    by_motion = jnp.where(is_valid[:, None], lever[in_b] - lever[in_a], 0.0)  # L
+    lower = jnp.linalg.cholesky(0.5 * (innovation + innovation.T))
+    half = jax.scipy.linalg.solve_triangular(lower, by_motion, lower=True)
+    is_known = 1.0 * ~(lever != 0.0).any()  # no motion: any regular matrix
+    spread = jnp.linalg.inv(half.T @ half + is_known * jnp.eye(3))
+    motion = -spread @ half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True)
+    after = conditioned(belief, gain, innovation, off + by_motion @ motion)
+    by = gain @ jax.scipy.linalg.cho_solve((lower, True), by_motion) + lever
+    change, more = lever @ motion, by @ spread @ by.T
     free = jnp.zeros(rows, jnp.bool_).at[other].set(True, mode="drop")
     gone = jnp.concatenate([jnp.zeros(first, jnp.bool_), jnp.repeat(free, 2)])
-    counts = moved.counts.at[kept].add(moved.counts[pairs[:, 1]], mode="drop")
-    heights = moved.heights.at[kept].set(_fused(moved.heights, pairs), mode="drop")
+    counts = belief.counts.at[kept].add(belief.counts[pairs[:, 1]], mode="drop")
     return after._replace(
-        covariance=jnp.where(gone[:, None] | gone, 0.0, after.covariance), heights=heights,
-        counts=jnp.where(free, 0, counts), owners=jnp.where(moved.owners == b, a, moved.owners),
-        groups=jnp.where(moved.groups == b, a, moved.groups),
+        robots=after.robots + change[:first].reshape(-1, ROBOT), places=after.places + change[first:].reshape(-1, 2),
+        covariance=jnp.where(gone[:, None] | gone, 0.0, after.covariance + 0.5 * (more + more.T)),
+        heights=belief.heights.at[kept].set(_fused(belief.heights, pairs), mode="drop"),
+        counts=jnp.where(free, 0, counts),
     )  # fmt: skip
 
 

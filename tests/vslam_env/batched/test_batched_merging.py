@@ -31,64 +31,81 @@ def common(belief: Any) -> tuple[np.ndarray, np.ndarray]:
     return padded, np.arange(MOST_PAIRS) < len(pairs)
 
 
+AWAY = np.array([3.0, -5.0, 2.0])
+
+
 def joined(belief: Any) -> Any:
     """Return the belief after a merge of both robots, one of which has another frame, by their common landmarks."""
     pairs, valid = common(belief)
-    away = merging.moved_group(belief, 1, jnp.array([3.0, -5.0, 2.0]), jnp.zeros((3, 3)))
+    away = merging.moved_group(belief, 1, jnp.asarray(AWAY))
     places = np.asarray(away.places, np.float64)
     motion = align_se2(places[pairs[valid, 0]], places[pairs[valid, 1]])
-    covariance = np.diag([0.02, 0.02, 0.01]) ** 2
-    return merging.joined(away, 0, 1, jnp.asarray(motion), jnp.asarray(covariance), jnp.asarray(pairs), valid)
+    near = merging.moved_group(away, 1, jnp.asarray(motion))
+    return merging.fused(near, jnp.asarray(pairs), valid, merging.lever_of(near, 1, jnp.zeros(2)))._replace(
+        groups=jnp.zeros(2, jnp.int32), owners=jnp.zeros(ROWS, jnp.int32)
+    )
 
 
 def test_a_group_that_is_moved_and_moved_back_is_as_before() -> None:
-    """A known motion changes the group alone, keeps its distances, and its inverse takes it back."""
+    """A motion changes the group alone, its start too, keeps its distances, and its inverse takes it back."""
     belief, _ = both_maps(1)
-    motion, nothing = np.array([1.0, -2.0, 0.7]), jnp.zeros((3, 3))
-    moved = merging.moved_group(belief, 1, jnp.asarray(motion), nothing)
+    motion = np.array([1.0, -2.0, 0.7])
+    moved = merging.moved_group(belief, 1, jnp.asarray(motion))
     np.testing.assert_array_equal(moved.robots[0], belief.robots[0])
     expected = compose(motion, np.asarray(belief.robots[1, :3], np.float64))
     np.testing.assert_allclose(moved.robots[1, :2], expected[:2], atol=1e-5)
     assert wrap_angle(float(moved.robots[1, 2]) - expected[2]) == pytest.approx(0.0, abs=1e-5)
-    back = merging.moved_group(moved, 1, jnp.asarray(inverse(motion)), nothing)
+    np.testing.assert_allclose(moved.robots[1, 5:], motion, atol=1e-6)
+    back = merging.moved_group(moved, 1, jnp.asarray(inverse(motion)))
     np.testing.assert_allclose(back.robots, belief.robots, atol=1e-5)
     np.testing.assert_allclose(back.places, belief.places, atol=1e-5)
     np.testing.assert_allclose(back.covariance, belief.covariance, atol=1e-7)
-    uncertain = merging.moved_group(belief, 1, jnp.asarray(motion), jnp.eye(3) * 0.01)
-    extra = np.asarray(uncertain.covariance - moved.covariance, np.float64)
-    assert np.linalg.matrix_rank(extra, tol=1e-4) == 3
-    assert extra[5, 5] > 0.01
-    assert not extra[:5].any()
+
+
+def test_levers_are_derivatives_of_the_motion() -> None:
+    """They equal finite differences about the origin, and a turn about another centre is that with a shift."""
+    belief, _ = both_maps(2)
+    lever = np.asarray(merging.lever_of(belief, 1, jnp.zeros(2)))
+    for axis in range(3):
+        step = 1e-2 * np.eye(3)[axis]
+        after, before = (merging.moved_group(belief, 1, jnp.asarray(sign * step)) for sign in (1.0, -1.0))
+        change = np.concatenate([np.ravel(after.robots - before.robots), np.ravel(after.places - before.places)])
+        np.testing.assert_allclose(lever[:, axis], change / 2e-2, atol=2e-3)
+    other = np.asarray(merging.lever_of(belief, 1, jnp.array([2.0, -1.0])))
+    np.testing.assert_allclose(other @ [0.0, 0.0, 1.0], lever @ [-1.0, -2.0, 1.0], atol=1e-5)
 
 
 def test_a_merge_is_conditioning_on_equal_places() -> None:
-    """Mean and covariance are those of the dense formulas in double precision, for all but the freed rows."""
+    """Means are those of dense formulas in double precision with a very uncertain motion, for all but the freed rows.
+
+    Without a motion the covariance is that of conditioning, but for what turns with headings.
+    """
     belief, _ = both_maps(2)
     pairs, valid = common(belief)
-    motion, spread = jnp.array([0.01, -0.02, 0.005]), jnp.diag(jnp.array([4e-4, 4e-4, 1e-4]))
-    moved = merging.moved_group(belief, 1, motion, merging.LOOSE**2 * spread)
-    mean = np.concatenate([np.ravel(moved.robots), np.ravel(moved.places)]).astype(np.float64)
-    covariance = np.asarray(moved.covariance, np.float64)
-    jacobian = np.zeros((2 * valid.sum(), len(mean)))
-    for i, (kept, other) in enumerate(pairs[valid]):
-        for axis in range(2):
-            jacobian[2 * i + axis, 10 + 2 * kept + axis] = 1.0
-            jacobian[2 * i + axis, 10 + 2 * other + axis] = -1.0
-    innovation = jacobian @ covariance @ jacobian.T + merging.EQUAL**2 * np.eye(len(jacobian))
-    gain = np.linalg.solve(innovation, jacobian @ covariance).T
-    mean -= gain @ jacobian @ mean
-    covariance -= gain @ jacobian @ covariance
-    found = merging.joined(belief, 0, 1, motion, spread, jnp.asarray(pairs), valid)
-    stay = np.ones(len(mean), bool)
-    stay[(10 + 2 * pairs[valid, 1][:, None] + np.arange(2)).ravel()] = False
-    np.testing.assert_allclose(found.robots.ravel(), mean[:10], atol=1e-4)
-    np.testing.assert_allclose(
-        np.asarray(found.covariance)[np.ix_(stay, stay)], covariance[np.ix_(stay, stay)], atol=2e-6
-    )
-    assert not np.asarray(found.covariance)[~stay].any()
-    assert (np.asarray(found.counts)[pairs[valid, 1]] == 0).all()
-    total = np.asarray(belief.counts)[pairs[valid]].sum(axis=1)
-    np.testing.assert_array_equal(np.asarray(found.counts)[pairs[valid, 0]], total)
+    for is_moved in (True, False):
+        lever = np.asarray(merging.lever_of(belief, 1, jnp.zeros(2)), np.float64) * is_moved
+        mean = np.concatenate([np.ravel(belief.robots), np.ravel(belief.places)]).astype(np.float64)
+        covariance = np.asarray(belief.covariance, np.float64) + 1e4 * lever @ lever.T
+        jacobian = np.zeros((2 * valid.sum(), len(mean)))
+        for i, (kept, other) in enumerate(pairs[valid]):
+            for axis in range(2):
+                jacobian[2 * i + axis, 16 + 2 * kept + axis] = 1.0
+                jacobian[2 * i + axis, 16 + 2 * other + axis] = -1.0
+        innovation = jacobian @ covariance @ jacobian.T + merging.EQUAL**2 * np.eye(len(jacobian))
+        gain = np.linalg.solve(innovation, jacobian @ covariance).T
+        mean -= gain @ jacobian @ mean
+        covariance -= gain @ jacobian @ covariance
+        found = merging.fused(belief, jnp.asarray(pairs), valid, jnp.asarray(lever))
+        stay = np.ones(len(mean), bool)
+        stay[(16 + 2 * pairs[valid, 1][:, None] + np.arange(2)).ravel()] = False
+        np.testing.assert_allclose(found.robots.ravel(), mean[:16], atol=1e-3)
+        np.testing.assert_allclose(
+            np.asarray(found.covariance)[np.ix_(stay, stay)], covariance[np.ix_(stay, stay)], atol=2e-4
+        )
+        assert not np.asarray(found.covariance)[~stay].any()
+        assert (np.asarray(found.counts)[pairs[valid, 1]] == 0).all()
+        total = np.asarray(belief.counts)[pairs[valid]].sum(axis=1)
+        np.testing.assert_array_equal(np.asarray(found.counts)[pairs[valid, 0]], total)
 
 
 def test_merged_robots_share_one_map_and_go_on() -> None:
@@ -118,7 +135,7 @@ def test_merged_robots_know_how_well_they_know_each_other() -> None:
         error[2] = wrap_angle(error[2])
         first, second = (np.asarray(by) for by in jax.jacfwd(seen_pose, (0, 1))(*jnp.asarray(poses)))
         among = np.asarray(merged.covariance, np.float64)
-        blocks = [[among[5 * i : 5 * i + 3, 5 * j : 5 * j + 3] for j in range(2)] for i in range(2)]
+        blocks = [[among[8 * i : 8 * i + 3, 8 * j : 8 * j + 3] for j in range(2)] for i in range(2)]
         jacobian = np.hstack([first, second])
         found.append(float(nees(error[None], (jacobian @ np.block(blocks) @ jacobian.T)[None])[0]))
     assert chi2.ppf(0.0005, 90) < sum(found) < chi2.ppf(0.9995, 90)

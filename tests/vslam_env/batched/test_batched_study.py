@@ -1,20 +1,36 @@
-"""Study of the Gaussian belief: its path beside that of the filter."""
+"""Study of simpler estimators: the Gaussian belief on the readings of an episode."""
 
-import pytest
+from dataclasses import asdict
 
-from studies.gaussian import STUDY, Config, play
-from studies.losses import trials
+import numpy as np
 
-SMALL = Config(worlds=("fig5",), presets=("standard",), duration=6.0, particles=(12,), policies=("frontier",), seeds=1)
+from studies import losses
+from studies.bounds.gaussian_team import gaussian_team
+from studies.fidelity import STUDY, Config, play, trials
+
+SMALL = Config(
+    worlds=("fig5",), presets=("standard",), duration=6.0, particles=(12,), robots=(2,), policies=("frontier",),
+    seeds=1, estimators=("one Gaussian",),
+)  # fmt: skip
 
 
-def test_a_trial_has_both_errors() -> None:
-    """Both estimates stay near the truth for a few seconds, and no landmark is held twice."""
+def test_a_trial_has_errors_of_the_same_size() -> None:
+    """Poses stay near the truth for a few seconds, recall is that of the environment, and returns are finite."""
     (trial,) = trials(SMALL)
-    row = play(SMALL, trial)
-    assert 0.0 < row["filter"] < 0.2
-    assert 0.0 < row["gaussian"] < 0.2
-    assert row["ratio"] == pytest.approx(row["gaussian"] / row["filter"])
-    assert row["copies"] == 1.0
-    (line,) = STUDY.tables[0].lines([{"preset": "standard", "world": "fig5"} | row])
-    assert line["ratio"].value == pytest.approx(row["ratio"])
+    row = asdict(trial) | play(SMALL, trial)
+    assert 0.0 < row["position_ratio"] < 10.0
+    assert abs(row["recall_change"]) < 0.05
+    assert abs(row["map_error_change"]) < 0.05
+    assert np.isfinite(row["own_returns"]).all()
+    assert row["false_merges"] == 0
+    (line,) = STUDY.tables[0].lines([row])
+    assert line["estimator"] == "one Gaussian"
+
+
+def test_paths_have_each_tick_once() -> None:
+    """Paths begin at the start and have one pose a tick, the last chunk included."""
+    config = SMALL.model_copy(update={"duration": 2.5})
+    episode = losses.recorded(config, losses.trials(config)[0])
+    team = gaussian_team(episode)
+    assert team.paths.shape == episode.true_paths.shape
+    np.testing.assert_allclose(team.paths[:, 0], 0.0, atol=1e-6)
