@@ -13,6 +13,7 @@ import numpy as np
 
 from slam_backend.core.blas import single_threaded_blas
 from slam_backend.core.validation import FloatArray
+from slam_backend.geometry import between
 from studies import losses
 from studies.bounds.episodes import RecordedEpisode, record_episode
 from studies.bounds.gaussian_team import check_jax, gaussian_team
@@ -183,7 +184,8 @@ def _outcome(episode: RecordedEpisode) -> _Outcome:
     kept = [merge for merge in record.merges if merge.undone is None]
     landmarks, recall = (float(np.mean([float(i[key]) for i in record.infos])) for key in ("map_rmse", "map_recall"))
     return _Outcome(
-        _position(record.estimated, episode), landmarks, recall, record.map_errors[:, 0], record.map_errors[:, -1],
+        _position(record.estimated, record.true_poses), landmarks, recall,
+        record.map_errors[:, 0], record.map_errors[:, -1],
         _padded([merge.time for merge in kept], episode), sum(merge.is_false for merge in kept),
     )  # fmt: skip
 
@@ -193,14 +195,15 @@ def _gaussian_outcome(episode: RecordedEpisode) -> _Outcome:
     team = gaussian_team(episode)
     first, last = team.map_errors.T
     return _Outcome(
-        _position(team.paths, episode), float(team.map_rmses.mean()), float(team.map_recalls.mean()), first, last,
-        _padded([TICK * tick for tick in team.merges], episode), team.false_merges,
+        _position(team.paths, episode.true_paths), float(team.map_rmses.mean()), float(team.map_recalls.mean()),
+        first, last, _padded([TICK * tick for tick in team.merges], episode), team.false_merges,
     )  # fmt: skip
 
 
-def _position(paths: FloatArray, episode: RecordedEpisode) -> float:
-    """Return the RMS position error [m] of paths (K, T, 3) in start frames."""
-    return float(np.sqrt((losses.errors_of(paths, episode)[..., :2] ** 2).sum(axis=-1).mean()))
+def _position(paths: FloatArray, truth: FloatArray) -> float:
+    """Return the RMS position error [m] of paths (K, T, 3) in start frames, given the true ones in the world frame."""
+    errors = paths - between(truth[:, :1], truth)
+    return float(np.sqrt((errors[..., :2] ** 2).sum(axis=-1).mean()))
 
 
 def _padded(times: Sequence[float], episode: RecordedEpisode) -> FloatArray:
