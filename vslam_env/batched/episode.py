@@ -59,7 +59,7 @@ class Episode(NamedTuple):
     Attributes:
         poses: (K, 3) float32 [m, m, rad], world frame. True poses.
         blocked: (K,) bool. Robots whose motion was blocked in the last tick.
-        belief, waits: What the team knows, and pairs of groups that wait.
+        belief, waits: Belief of the team, and pairs of groups that wait.
         scores: Errors of the maps.
         tick: () int32. Ticks since the reset.
     """
