@@ -24,7 +24,7 @@ MAX_ITERATIONS = 100
 FIRST_DAMPING = 1e-3  # from dead reckoning
 GIVEN_DAMPING = 1e-6  # from a given initial estimate
 LEAST_DAMPING, MAX_DAMPING = 1e-9, 1e12
-LEAST_DECREASE = 1e-6  # relative decrease of the cost at convergence
+LEAST_DECREASE = 1e-8  # relative decrease of the cost at convergence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
