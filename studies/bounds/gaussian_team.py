@@ -24,7 +24,6 @@ class GaussianTeam(NamedTuple):
         map_rmses, map_recalls: (K,) float64. Errors [m] and recall of the maps at the end.
         merges: Ticks of the merges.
         false_merges: Number of merges that were off by more than 0.5 m or 5 degrees when made.
-        landmarks: Rows in use at the end.
     """
 
     paths: FloatArray
@@ -33,7 +32,6 @@ class GaussianTeam(NamedTuple):
     map_recalls: FloatArray
     merges: list[int]
     false_merges: int
-    landmarks: int
 
 
 def check_jax() -> None:
@@ -89,7 +87,7 @@ def gaussian_team(episode: RecordedEpisode) -> GaussianTeam:
     every, last = np.concatenate(robots).swapaxes(0, 1), scores(belief)
     return GaussianTeam(
         between(every[..., START:], every[..., :3]), np.stack(errors, axis=1), np.asarray(last.map_rmses),
-        np.asarray(last.map_recalls), merges, false, int((belief.counts > 0).sum()),
+        np.asarray(last.map_recalls), merges, false,
     )  # fmt: skip
 
 

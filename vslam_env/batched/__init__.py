@@ -1,1 +1,1 @@
-"""Beliefs in arrays of fixed shape, for batches of teams on an accelerator; needs the extra `jax`."""
+"""Teams in arrays of fixed shape, for batches on an accelerator: world, belief and episodes; needs the extra `jax`."""

@@ -5,7 +5,6 @@ Hypotheses from pairs of landmarks that look alike in both maps are scored by th
 the paths of both groups to their common landmarks are.
 """
 
-import math
 from typing import NamedTuple
 
 import jax
@@ -13,7 +12,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from slam_backend.maps.alignment_types import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions
-from vslam_env.batched.belief import Belief
+from vslam_env.batched.belief import Belief, rotation, symmetric, wrapped
+from vslam_env.batched.merging import levers
 
 CANDIDATES = 256  # pairs of landmarks that look alike
 HYPOTHESES = 512
@@ -83,10 +83,7 @@ def align(
     first, second = (belief.places[column] for column in rows.T)
     blocks = _blocks(belief)
     spreads = tuple(blocks[column] for column in rows.T)
-    heights = [belief.heights[column] for column in rows.T]
-    tall = (heights[0][:, 0] - heights[1][:, 0]) ** 2 / (
-        heights[0][:, 1] + heights[1][:, 1] + options.position_floor**2
-    )
+    tall = _tall(belief, rows, options)
 
     def inliers(motion: Array) -> Array:
         """Return which candidates agree with a motion (C,)."""
@@ -123,12 +120,6 @@ def _blocks(belief: Belief) -> Array:
     return belief.covariance[first:, first:].reshape(rows, 2, rows, 2)[each, :, each]
 
 
-def _rotation(angle: Array) -> Array:
-    """Return the matrix (2, 2) of a rotation."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.array([[c, -s], [s, c]])
-
-
 def _hypotheses(
     first: Array, second: Array, valid: Array, key: Array, options: AlignmentOptions
 ) -> tuple[Array, Array]:  # fmt: skip
@@ -137,7 +128,7 @@ def _hypotheses(
     in_a, in_b = (part[drawn[:, 1]] - part[drawn[:, 0]] for part in (first, second))
     turns = jnp.arctan2(in_a[:, 1], in_a[:, 0]) - jnp.arctan2(in_b[:, 1], in_b[:, 0])
     middles = [0.5 * (part[drawn[:, 0]] + part[drawn[:, 1]]) for part in (first, second)]
-    shifts = middles[0] - jnp.einsum("hij,hj->hi", jax.vmap(_rotation)(turns), middles[1])
+    shifts = middles[0] - jnp.einsum("hij,hj->hi", jax.vmap(rotation)(turns), middles[1])
     lengths = [jnp.linalg.norm(part, axis=1) for part in (in_a, in_b)]
     return jnp.column_stack([shifts, turns]), jnp.minimum(*lengths) > 0.5 * options.min_spread
 
@@ -146,9 +137,15 @@ def _residuals(
     motion: Array, first: Array, second: Array, spreads: tuple[Array, Array], options: AlignmentOptions
 ) -> tuple[Array, Array]:
     """Return a - R b - t (C, 2) of all candidates, and the covariances (C, 2, 2)."""
-    turned = _rotation(motion[2])
+    turned = rotation(motion[2])
     off = first - second @ turned.T - motion[:2]
     return off, spreads[0] + turned @ spreads[1] @ turned.T + options.position_floor**2 * jnp.eye(2)
+
+
+def _tall(belief: Belief, rows: Array, options: AlignmentOptions) -> Array:
+    """Return the squared Mahalanobis distances (C,) of the heights of pairs of rows (C, 2)."""
+    one, other = belief.heights[rows[:, 0]], belief.heights[rows[:, 1]]
+    return (one[:, 0] - other[:, 0]) ** 2 / (one[:, 1] + other[:, 1] + options.position_floor**2)
 
 
 def _squared(off: Array, spread: Array) -> Array:
@@ -158,19 +155,12 @@ def _squared(off: Array, spread: Array) -> Array:
     return (quadratic - 2.0 * spread[:, 0, 1] * off[:, 0] * off[:, 1]) / determinant
 
 
-def _levers(motion: Array, second: Array) -> Array:
-    """Return the derivatives (C, 2, 3) of R b + t by the motion."""
-    turned = second @ _rotation(motion[2]).T
-    by = jnp.zeros((len(second), 2, 3)).at[:, 0, 0].set(1.0).at[:, 1, 1].set(1.0)
-    return by.at[:, 0, 2].set(-turned[:, 1]).at[:, 1, 2].set(turned[:, 0])
-
-
 def _refined(
     motion: Array, first: Array, second: Array, spreads: tuple[Array, Array], inside: Array, options: AlignmentOptions
 ) -> Array:
     """Return the motion after one Gauss-Newton iteration over its inliers."""
     off, spread = _residuals(motion, first, second, spreads, options)
-    lever = jnp.where(inside[:, None, None], _levers(motion, second), 0.0)
+    lever = jnp.where(inside[:, None, None], levers(second @ rotation(motion[2]).T), 0.0)
     weighted = jnp.linalg.solve(spread, lever)
     information = jnp.einsum("cia,cib->ab", lever, weighted) + 1e-6 * jnp.eye(3)
     return motion + jnp.linalg.solve(information, jnp.einsum("cia,ci->a", weighted, off))
@@ -194,24 +184,24 @@ def _whole(
     first, each = belief.first_place, len(kept)
     columns = [(first + 2 * column[:, None] + jnp.arange(2)).ravel() for column in pairs.T]
     of_a, of_b = (belief.covariance[column[:, None], column] for column in columns)
-    turned = jnp.kron(jnp.eye(each), _rotation(motion[2]))
+    turned = jnp.kron(jnp.eye(each), rotation(motion[2]))
     is_kept = jnp.repeat(kept, 2)
     spread = of_a + turned @ of_b @ turned.T + options.position_floor**2 / 4.0 * jnp.eye(2 * each)
     spread = jnp.where(is_kept[:, None] & is_kept, spread, jnp.eye(2 * each))
     places = [belief.places[column] for column in pairs.T]
-    lever = jnp.where(is_kept[:, None], _levers(motion, places[1]).reshape(-1, 3), 0.0)
-    off = jnp.where(kept[:, None], places[0] - places[1] @ _rotation(motion[2]).T - motion[:2], 0.0).ravel()
-    factor = jax.scipy.linalg.cho_factor(0.5 * (spread + spread.T), lower=True)
+    lever = jnp.where(is_kept[:, None], levers(places[1] @ rotation(motion[2]).T).reshape(-1, 3), 0.0)
+    off = jnp.where(kept[:, None], places[0] - places[1] @ rotation(motion[2]).T - motion[:2], 0.0).ravel()
+    factor = jax.scipy.linalg.cho_factor(symmetric(spread), lower=True)
     weighted = jax.scipy.linalg.cho_solve(factor, lever)
     covariance = jnp.linalg.inv(lever.T @ weighted + 1e-6 * jnp.eye(3))
-    return 0.5 * (covariance + covariance.T), motion + covariance @ weighted.T @ off
+    return symmetric(covariance), motion + covariance @ weighted.T @ off
 
 
 def _is_different(motions: Array, motion: Array, centre: Array) -> Array:
     """Return which motions (h,) move the centre of the inliers elsewhere, or turn it."""
-    moved = jax.vmap(lambda each: _rotation(each[2]) @ centre + each[:2])
+    moved = jax.vmap(lambda each: rotation(each[2]) @ centre + each[:2])
     away = jnp.linalg.norm(moved(motions) - moved(motion[None]), axis=1)
-    turn = (motions[:, 2] - motion[2] + math.pi) % (2.0 * math.pi) - math.pi
+    turn = wrapped(motions[:, 2] - motion[2])
     return (away > DISTINCT_TRANSLATION) | (jnp.abs(turn) > DISTINCT_ROTATION)
 
 
@@ -242,9 +232,6 @@ def copies(belief: Belief, alike: Array, options: AlignmentOptions) -> tuple[Arr
     cross = block(at[0], at[1])
     spread = block(at[0], at[0]) + block(at[1], at[1]) - cross - cross.swapaxes(1, 2)
     spread += options.position_floor**2 * jnp.eye(2)
-    heights = [belief.heights[column] for column in rows.T]
-    tall = (heights[0][:, 0] - heights[1][:, 0]) ** 2 / (
-        heights[0][:, 1] + heights[1][:, 1] + options.position_floor**2
-    )
+    tall = _tall(belief, rows, options)
     distances = _squared(belief.places[rows[:, 0]] - belief.places[rows[:, 1]], spread) + tall
     return _one_to_one(rows, valid & (distances < options.position_gate), distances)

@@ -7,6 +7,7 @@ are pure and can be batched by `jax.vmap`. Heights of landmarks are measured ind
 A team's robots each begin in a frame of their own; robots and landmarks of different groups are independent.
 """
 
+import math
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -116,6 +117,17 @@ def start(num_robots: int, rows: int, size: int, assumed: Assumed) -> Belief:
     )  # fmt: skip
 
 
+def rotation(angle: Array) -> Array:
+    """Return the matrix (2, 2) of a rotation."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.array([[c, -s], [s, c]])
+
+
+def wrapped(angles: Array) -> Array:
+    """Return angles in [-pi, pi)."""
+    return (angles + math.pi) % (2.0 * math.pi) - math.pi
+
+
 # ---------------------------------------------------------------------- motion
 
 
@@ -142,8 +154,7 @@ def motion_noise(heading: Array, odometry: Array, assumed: Assumed) -> Array:
     along, across = (
         sigma**2 * square + assumed.floor_position**2 for sigma in (assumed.sigma_along, assumed.sigma_across)
     )
-    c, s = jnp.cos(heading), jnp.sin(heading)
-    turned = jnp.array([[c, -s], [s, c]])
+    turned = rotation(heading)
     of_heading = assumed.sigma_heading**2 * square + (assumed.sigma_turn * turn) ** 2 + assumed.floor_heading**2
     planar = turned @ jnp.diag(jnp.stack([along, across])) @ turned.T
     return jnp.zeros((ROBOT, ROBOT)).at[:2, :2].set(planar).at[2, 2].set(of_heading)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from vslam_env.batched.belief import ROBOT, START, Belief, conditioned, symmetric
+from vslam_env.batched.belief import ROBOT, START, Belief, conditioned, rotation, symmetric
 
 EQUAL = 1e-2  # [m] standard deviation of the difference of both copies of a landmark; float32 needs as much
 
@@ -16,23 +16,22 @@ def moved_group(belief: Belief, group: Array, motion: Array) -> Belief:
         group: () int32. First robot of the group.
         motion: (3,) [m, m, rad]. Motion (tx, ty, theta) from the group's frame to the new one.
     """
-    x, y, turn = motion
-    c, s = jnp.cos(turn), jnp.sin(turn)
-    rotation, shift = jnp.array([[c, -s], [s, c]]), jnp.stack([x, y])
+    shift, turn = motion[:2], motion[2]
+    matrix = rotation(turn)
     robots = belief.groups == group
     rows = (belief.owners == group) & (belief.counts > 0)
     of_robot, turned = jnp.eye(ROBOT), belief.robots
     for first in (0, START):  # its pose and its start
         at = slice(first, first + 2)
-        of_robot = of_robot.at[at, at].set(rotation)
-        turned = turned.at[:, at].set(belief.robots[:, at] @ rotation.T + shift).at[:, first + 2].add(turn)
+        of_robot = of_robot.at[at, at].set(matrix)
+        turned = turned.at[:, at].set(belief.robots[:, at] @ matrix.T + shift).at[:, first + 2].add(turn)
     by_robots = jnp.where(robots[:, None, None], of_robot, jnp.eye(ROBOT))
-    by_places = jnp.where(rows[:, None, None], rotation, jnp.eye(2))
+    by_places = jnp.where(rows[:, None, None], matrix, jnp.eye(2))
     half = _rotated(belief.covariance, by_robots, by_places)
     moved = _rotated(half.T, by_robots, by_places)
     return belief._replace(
         robots=jnp.where(robots[:, None], turned, belief.robots),
-        places=jnp.where(rows[:, None], belief.places @ rotation.T + shift, belief.places),
+        places=jnp.where(rows[:, None], belief.places @ matrix.T + shift, belief.places),
         covariance=symmetric(moved),
     )
 
@@ -41,15 +40,15 @@ def lever_of(belief: Belief, group: Array, centre: Array) -> Array:
     """Return the derivatives (n, 3) of all variables by a group's motion: a shift, and a turn about a centre (2,)."""
     robots = jnp.zeros((len(belief.groups), ROBOT, 3))
     for first in (0, START):
-        robots = robots.at[:, first : first + 2].set(_lever(belief.robots[:, first : first + 2] - centre))
+        robots = robots.at[:, first : first + 2].set(levers(belief.robots[:, first : first + 2] - centre))
         robots = robots.at[:, first + 2, 2].set(1.0)
     of_robots = jnp.where((belief.groups == group)[:, None, None], robots, 0.0)
     rows = (belief.owners == group) & (belief.counts > 0)
-    of_places = jnp.where(rows[:, None, None], _lever(belief.places - centre), 0.0)
+    of_places = jnp.where(rows[:, None, None], levers(belief.places - centre), 0.0)
     return jnp.concatenate([of_robots.reshape(-1, 3), of_places.reshape(-1, 3)])
 
 
-def _lever(away: Array) -> Array:
+def levers(away: Array) -> Array:
     """Return the derivatives (m, 2, 3) of positions (m, 2), from the centre, by a motion."""
     by = jnp.zeros((len(away), 2, 3)).at[:, 0, 0].set(1.0).at[:, 1, 1].set(1.0)
     return by.at[:, 0, 2].set(-away[:, 1]).at[:, 1, 2].set(away[:, 0])
@@ -86,7 +85,7 @@ def fused(belief: Belief, pairs: Array, valid: Array, lever: Array) -> Belief:
     innovation += jnp.diag(jnp.where(is_valid, EQUAL**2, 1.0))
     off = jnp.where(valid[:, None], belief.places[pairs[:, 1]] - belief.places[pairs[:, 0]], 0.0).ravel()
     by_motion = jnp.where(is_valid[:, None], lever[in_b] - lever[in_a], 0.0)  # L
-    lower = jnp.linalg.cholesky(0.5 * (innovation + innovation.T))
+    lower = jnp.linalg.cholesky(symmetric(innovation))
     half = jax.scipy.linalg.solve_triangular(lower, by_motion, lower=True)
     is_known = 1.0 * ~(lever != 0.0).any()  # no motion: any regular matrix
     spread = jnp.linalg.inv(half.T @ half + is_known * jnp.eye(3))
@@ -99,7 +98,7 @@ def fused(belief: Belief, pairs: Array, valid: Array, lever: Array) -> Belief:
     counts = belief.counts.at[kept].add(belief.counts[pairs[:, 1]], mode="drop")
     return after._replace(
         robots=after.robots + change[:first].reshape(-1, ROBOT), places=after.places + change[first:].reshape(-1, 2),
-        covariance=jnp.where(gone[:, None] | gone, 0.0, after.covariance + 0.5 * (more + more.T)),
+        covariance=jnp.where(gone[:, None] | gone, 0.0, after.covariance + symmetric(more)),
         heights=belief.heights.at[kept].set(_fused(belief.heights, pairs), mode="drop"),
         counts=jnp.where(free, 0, counts),
     )  # fmt: skip

@@ -14,7 +14,7 @@ from jax import Array
 
 from slam_backend.core.validation import argument_error
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
-from vslam_env.batched.belief import Frame
+from vslam_env.batched.belief import Frame, wrapped
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.sensors._landmark_kernels import NEAREST, NEAREST_FALSE_POINT
 from vslam_env.simulation.scenario import Scenario
@@ -182,11 +182,6 @@ def read_odometry(before: Array, after: Array, scene: Scene, draws: Array, hardw
     c, s = stretch * jnp.cos(into_robot), stretch * jnp.sin(into_robot)
     ahead, left = c * shift[:, 0] - s * shift[:, 1], s * shift[:, 0] + c * shift[:, 1]
     return jnp.column_stack([ahead, left, wrapped(turned + turn)])
-
-
-def wrapped(angles: Array) -> Array:
-    """Return angles in [-pi, pi)."""
-    return (angles + math.pi) % (2.0 * math.pi) - math.pi
 
 
 # ---------------------------------------------------------------------- sight
