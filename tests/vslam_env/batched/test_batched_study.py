@@ -3,10 +3,8 @@
 from dataclasses import asdict
 
 import numpy as np
-import pytest
 
 from studies import losses
-from studies.bounds import gaussian_team as belief_of_teams
 from studies.bounds.gaussian_team import gaussian_team
 from studies.fidelity import STUDY, Config, play, trials
 
@@ -14,12 +12,6 @@ SMALL = Config(
     worlds=("fig5",), presets=("standard",), duration=6.0, particles=(12,), robots=(2,), policies=("frontier",),
     seeds=1, estimators=("one Gaussian",),
 )  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def few_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make room for the landmarks of a few seconds only."""
-    monkeypatch.setattr(belief_of_teams, "ROWS", 128)
 
 
 def test_a_trial_has_errors_of_the_same_size() -> None:
