@@ -22,7 +22,7 @@ from slam_backend.geometry import compose, rotation, wrap_angle
 from slam_backend.maps.alignment import align_maps
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
 from slam_backend.maps.descriptor_matching import similar_pairs
-from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 from slam_backend.smoother.duplicates import without_duplicates
 from slam_backend.smoother.graph import UNINFORMATIVE, SlamGraph
 from slam_backend.smoother.graph_reduction import without_unused_frames
@@ -69,7 +69,7 @@ class _Sightings(NamedTuple):
     by_others: IntArray
 
 
-UNSEEN = -1
+UNSEEN, NEVER = -1, np.iinfo(np.int64).max
 
 
 def alignment_options(descriptor_gate: float) -> AlignmentOptions:
@@ -79,12 +79,8 @@ def alignment_options(descriptor_gate: float) -> AlignmentOptions:
 
 def are_distinct(looks: Float32Array, options: AlignmentOptions) -> BoolArray:
     """Return which landmarks (l, d) look like few others: those by which a robot can be found."""
-    return np.bincount(_alike(looks, options)[:, 0], minlength=len(looks)) > 0
-
-
-def _alike(looks: Float32Array, options: AlignmentOptions) -> IntArray:
-    """Return the pairs (n, 2) of landmarks (l, d) that look alike, and like few others; each is like itself."""
-    return similar_pairs(looks, looks, options.descriptor_gate, options.max_similar + 1)
+    alike = similar_pairs(looks, looks, options.descriptor_gate, options.max_similar + 1)  # each is like itself
+    return np.bincount(alike[:, 0], minlength=len(looks)) > 0
 
 
 def relocalise(
@@ -102,12 +98,11 @@ def relocalise(
     if len(rows) < 2 * MIN_PAIRS:
         return None
     at = np.searchsorted(known.ids, graph.landmark_ids[rows])
-    alike = _alike(known.descriptors[at], options)
-    alike = alike[alike[:, 0] != alike[:, 1]]
     suspected = None
-    for robot in range(len(graph.last_keys)) if len(alike) >= 2 * MIN_PAIRS else ():
+    for robot in range(len(graph.last_keys)):
         seen = _sightings(graph, robot)
-        split = _split(seen, rows[alike])
+        of_known = _Sightings(seen.first[rows], seen.last[rows], seen.by_others[rows])
+        split = _split(of_known, known.descriptors[at], options)
         if split is None:
             continue
         first = seen.first[rows]
@@ -137,28 +132,34 @@ def _sightings(graph: SlamGraph, robot: int) -> _Sightings:
     return _Sightings(first, last, by_others)
 
 
-def _split(seen: _Sightings, alike: IntArray) -> int | None:
+def _split(seen: _Sightings, looks: Float32Array, options: AlignmentOptions) -> int | None:
     """Return the key from which a robot sees most landmarks for the first time that look like those seen before alone.
 
     Args:
-        seen: Sightings of the robot.
-        alike: (n, 2) pairs of landmarks that look alike, each in both orders.
+        seen: Sightings of l landmarks.
+        looks: (l, d) float32. Their descriptors.
+        options: Gates and limits of the alignment.
     """
-    old, new = alike.T
-    apart = (seen.last[old] >= 0) & (seen.last[old] < seen.first[new]) & (seen.by_others[new] == UNSEEN)
-    ended = np.full(len(seen.first), np.iinfo(np.int64).max)
-    np.minimum.at(ended, new[apart], seen.last[old[apart]])
-    later = np.flatnonzero(ended < seen.first)
-    begins = seen.first[later]
+    first, last, by_others = seen
+    own = last != UNSEEN
+    new = np.flatnonzero(own & (by_others == UNSEEN) & (first > last[own].min(initial=NEVER)))
+    old = np.flatnonzero(own & (last < first[new].max(initial=UNSEEN)))
+    if min(len(new), len(old)) < MIN_PAIRS:
+        return None
+    pairs = similar_pairs(looks[new], looks[old], options.descriptor_gate, options.max_similar + 1)
+    ended = np.full(len(first), NEVER)
+    np.minimum.at(ended, new[pairs[:, 0]], last[old[pairs[:, 1]]])
+    later = np.flatnonzero(ended < first)
+    begins = first[later]
     counts = ((ended[later] < begins[:, None]) & (begins >= begins[:, None])).sum(axis=1)
     return int(begins[counts == counts.max()].min()) if counts.max(initial=0) >= MIN_PAIRS else None
 
 
 def _map_of(graph: SlamGraph, known: LandmarkTable, rows: IntArray, at: IntArray) -> LandmarkMap:
     """Return landmarks of a graph as a map."""
-    return LandmarkMap(
+    return unchecked_map(
         graph.landmarks[rows], known.covariances[at][:, UNPACK_INDEX], known.descriptors[at],
-        ids=graph.landmark_ids[rows],
+        np.ones(len(rows), np.int64), graph.landmark_ids[rows],
     )  # fmt: skip
 
 
