@@ -137,7 +137,7 @@ def _split(seen: _Sightings, looks: Float32Array, options: AlignmentOptions) -> 
 
     Args:
         seen: Sightings of l landmarks.
-        looks: (l, d) float32. Their descriptors.
+        looks: (l, d) float32. Descriptors of these.
         options: Gates and limits of the alignment.
     """
     first, last, by_others = seen
