@@ -1,5 +1,7 @@
 """Fidelity of simpler estimators: what an environment with one of them would get wrong, on the same worlds and actions.
 
+Readings are those of the environment, but for `batched`, which draws its own in the same worlds.
+
 python -m studies.fidelity --worlds office,loops --seeds 4
 """
 
@@ -12,11 +14,11 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from slam_backend.core.blas import single_threaded_blas
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import FloatArray, argument_error
 from slam_backend.geometry import between
 from studies import losses
 from studies.bounds.episodes import RecordedEpisode, record_episode
-from studies.bounds.gaussian_team import check_jax, gaussian_team
+from studies.bounds.gaussian_team import GaussianTeam, check_jax, gaussian_team, simulated_team
 from training.bench.exploration.players import parted
 from training.commands.study import run_program
 from training.episodes.guard import GuardedTeam
@@ -28,10 +30,10 @@ from vslam_env.config import TICK, EnvConfig
 
 Estimator = Literal[
     "no smoother", "no smoother, 400 particles", "30 keyframes", "60 keyframes", "60 keyframes, 3 iterations",
-    "every 200 ticks", "10 particles", "1 particle", "one Gaussian",
+    "every 200 ticks", "10 particles", "1 particle", "one Gaussian", "batched",
 ]  # fmt: skip
 FEW: dict[str, Any] = {"further_keys": 0, "steps_per_key": 10**6, "landmarks_per_key": 10**6, "closure_after": 0}
-OPTIONS: Mapping[str, Mapping[str, Any]] = {  # of the filters; "one Gaussian" is no filter
+OPTIONS: Mapping[str, Mapping[str, Any]] = {  # of the filters; batched teams are none
     "no smoother": {"rejuvenate_every": None},
     "no smoother, 400 particles": {"rejuvenate_every": None, "num_particles": 400},
     "30 keyframes": {"smoothing": FEW | {"max_keys": 30, "recent_keys": 15}},
@@ -61,8 +63,11 @@ class Config(losses.Config):
 
     def check(self) -> None:
         """Refuse what the episodes refuse, and a missing package."""
-        if "one Gaussian" in self.estimators:
+        if not set(self.estimators) <= OPTIONS.keys():
             check_jax()
+        goals = [policy for policy in self.policies if parted(policy).action_type == "goal"]
+        if "batched" in self.estimators and goals:
+            raise argument_error("policy", "policies with @continuous or @discrete", goals[0], "Or omit batched.")
         super().check()
 
 
@@ -154,7 +159,9 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     whole = exact(config, losses.Trial(**shared))
     a = _outcome(whole.episode)
     if trial.estimator == "one Gaussian":
-        b = _gaussian_outcome(whole.episode)
+        b = _gaussian_outcome(gaussian_team(whole.episode), whole.episode)
+    elif trial.estimator == "batched":
+        b = _gaussian_outcome(simulated_team(whole.episode, trial.seed, whole.actions), whole.episode)
     else:
         changed = losses.environment(config, trial).replace(belief={"filter": dict(OPTIONS[trial.estimator])})
         b = _outcome(run(changed, trial.seed, trial.policy, whole.actions).episode)
@@ -190,12 +197,11 @@ def _outcome(episode: RecordedEpisode) -> _Outcome:
     )  # fmt: skip
 
 
-def _gaussian_outcome(episode: RecordedEpisode) -> _Outcome:
-    """Return the errors of the Gaussian belief on the same readings."""
-    team = gaussian_team(episode)
+def _gaussian_outcome(team: GaussianTeam, episode: RecordedEpisode) -> _Outcome:
+    """Return the errors of a batched team."""
     first, last = team.map_errors.T
     return _Outcome(
-        _position(team.paths, episode.true_paths), float(team.map_rmses.mean()), float(team.map_recalls.mean()),
+        _position(team.paths, team.true_paths), float(team.map_rmses.mean()), float(team.map_recalls.mean()),
         first, last, _padded([TICK * tick for tick in team.merges], episode), team.false_merges,
     )  # fmt: skip
 
@@ -254,9 +260,10 @@ STUDY = Study(
     name="fidelity",
     about="""Play the actions of episodes again with simpler estimators, and compare what the environment tells.
 
-    Readings are the same. An estimator stands for the environment's own if its position and landmark errors are at most
-    twice as large, recall differs by at most four points and E by 3 cm in the mean, returns of robots correlate by 0.9,
-    merges come at most 10 s later in the median, and false ones are not more frequent.
+    Readings are the same, but for `batched`, which simulates its own. An estimator stands for the environment's own if
+    its position and landmark errors are at most twice as large, recall differs by at most four points and E by 3 cm in
+    the mean, returns of robots correlate by 0.9, merges come at most 10 s later in the median, and false ones are not
+    more frequent.
     """,
     config=Config,
     trial=Trial,

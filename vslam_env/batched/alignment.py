@@ -148,6 +148,12 @@ def _tall(belief: Belief, rows: Array, options: AlignmentOptions) -> Array:
     return (one[:, 0] - other[:, 0]) ** 2 / (one[:, 1] + other[:, 1] + options.position_floor**2)
 
 
+def _inverse(matrices: Array) -> Array:
+    """Return the inverses of matrices (C, 2, 2)."""
+    (a, b), (c, d) = jnp.moveaxis(matrices, 0, -1)
+    return jnp.moveaxis(jnp.array([[d, -b], [-c, a]]) / (a * d - b * c), -1, 0)
+
+
 def _squared(off: Array, spread: Array) -> Array:
     """Return squared Mahalanobis distances (C,)."""
     determinant = spread[:, 0, 0] * spread[:, 1, 1] - spread[:, 0, 1] ** 2
@@ -161,7 +167,7 @@ def _refined(
     """Return the motion after one Gauss-Newton iteration over its inliers."""
     off, spread = _residuals(motion, first, second, spreads, options)
     lever = jnp.where(inside[:, None, None], levers(second @ rotation(motion[2]).T), 0.0)
-    weighted = jnp.linalg.solve(spread, lever)
+    weighted = _inverse(spread) @ lever
     information = jnp.einsum("cia,cib->ab", lever, weighted) + 1e-6 * jnp.eye(3)
     return motion + jnp.linalg.solve(information, jnp.einsum("cia,ci->a", weighted, off))
 

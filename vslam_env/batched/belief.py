@@ -322,8 +322,9 @@ def conditioned(belief: Belief, gain: Array, innovation: Array, off: Array) -> B
         off: (m,). Differences of the numbers read from those expected.
     """
     lower = jnp.linalg.cholesky(0.5 * (innovation + innovation.T))
-    half = jax.scipy.linalg.solve_triangular(lower, gain.T, lower=True)
-    change, first = half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True), belief.first_place
+    inverse = jax.scipy.linalg.solve_triangular(lower, jnp.eye(len(lower)), lower=True)  # slow for n right-hand sides
+    half, first = inverse @ gain.T, belief.first_place
+    change = half.T @ (inverse @ off)
     robots, places = change[:first].reshape(-1, ROBOT), change[first:].reshape(-1, 2)
     count = len(robots)
     each, headings = jnp.arange(count), ROBOT * jnp.arange(count) + 2

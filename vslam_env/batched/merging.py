@@ -86,12 +86,13 @@ def fused(belief: Belief, pairs: Array, valid: Array, lever: Array) -> Belief:
     off = jnp.where(valid[:, None], belief.places[pairs[:, 1]] - belief.places[pairs[:, 0]], 0.0).ravel()
     by_motion = jnp.where(is_valid[:, None], lever[in_b] - lever[in_a], 0.0)  # L
     lower = jnp.linalg.cholesky(symmetric(innovation))
-    half = jax.scipy.linalg.solve_triangular(lower, by_motion, lower=True)
+    inverse = jax.scipy.linalg.solve_triangular(lower, jnp.eye(len(lower)), lower=True)
+    half = inverse @ by_motion
     is_known = 1.0 * ~(lever != 0.0).any()  # no motion: any regular matrix
     spread = jnp.linalg.inv(half.T @ half + is_known * jnp.eye(3))
-    motion = -spread @ half.T @ jax.scipy.linalg.solve_triangular(lower, off, lower=True)
+    motion = -spread @ half.T @ (inverse @ off)
     after = conditioned(belief, gain, innovation, off + by_motion @ motion)
-    by = gain @ jax.scipy.linalg.cho_solve((lower, True), by_motion) + lever
+    by = gain @ (inverse.T @ half) + lever
     change, more = lever @ motion, by @ spread @ by.T
     free = jnp.zeros(rows, jnp.bool_).at[other].set(True, mode="drop")
     gone = jnp.concatenate([jnp.zeros(first, jnp.bool_), jnp.repeat(free, 2)])

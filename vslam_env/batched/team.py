@@ -33,8 +33,8 @@ def no_waits(num_robots: int) -> Waits:
 
 
 def merged(
-    belief: Belief, waits: Waits, tick: Array, key: Array, assumed: Assumed, options: AlignmentOptions,
-    min_sigmas: float,
+    belief: Belief, waits: Waits, tick: Array, key: Array, in_contact: Array, assumed: Assumed,
+    options: AlignmentOptions, min_sigmas: float,
 ) -> tuple[Belief, Waits]:  # fmt: skip
     """Return the belief after an attempt to merge two groups, with landmarks that are held twice fused.
 
@@ -44,10 +44,11 @@ def merged(
     Args:
         tick: () int32.
         key: Key of the random search.
+        in_contact: (K, K) bool. Pairs of groups that can exchange maps, by their first robots.
         assumed, options, min_sigmas: Gates and limits.
     """
     alike = look_alikes(belief, assumed.descriptor_gate)
-    a, b = best_pair(belief, alike, waits.until <= tick)
+    a, b = best_pair(belief, alike, in_contact & (waits.until <= tick))
     found = align(belief, alike, a, b, key, options, min_sigmas)
     last = waits.excess[a, b]
     stays = jnp.isfinite(last) & (found.excess >= MIN_IMPROVEMENT * last)

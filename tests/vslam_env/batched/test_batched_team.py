@@ -16,7 +16,7 @@ merging = pytest.importorskip("vslam_env.batched.merging")
 scoring = pytest.importorskip("vslam_env.batched.scoring")
 team = pytest.importorskip("vslam_env.batched.team")
 OPTIONS, ROWS, AWAY = AlignmentOptions(), 96, np.array([3.0, -5.0, 2.0])
-attempt = jax.jit(partial(team.merged, assumed=ASSUMED, options=OPTIONS, min_sigmas=5.0))
+attempt = jax.jit(partial(team.merged, in_contact=jnp.array(True), assumed=ASSUMED, options=OPTIONS, min_sigmas=5.0))
 
 
 def apart(seed: int) -> Any:
@@ -58,7 +58,9 @@ def test_robots_without_common_looks_stay_apart() -> None:
 def test_uncertain_starts_wait_while_waiting_helps() -> None:
     """A pair beyond the limit is refused for some ticks; then it merges if it has become hardly more certain."""
     belief = apart(3)
-    strict = jax.jit(partial(team.merged, assumed=ASSUMED, options=OPTIONS, min_sigmas=1000.0))
+    strict = jax.jit(
+        partial(team.merged, in_contact=jnp.array(True), assumed=ASSUMED, options=OPTIONS, min_sigmas=1000.0)
+    )
     after, waits = strict(belief, team.no_waits(2), 0, jax.random.key(0))
     assert np.asarray(after.groups).tolist() == [0, 1]
     assert waits.until[0, 1] == team.WAIT

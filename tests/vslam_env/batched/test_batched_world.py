@@ -166,12 +166,10 @@ def test_frames_have_the_noise_of_the_camera() -> None:
     assert false <= expected_false + norm.ppf(0.9999) * np.sqrt(expected_false) + 1.0
 
 
-def test_worlds_need_room_and_landmarks() -> None:
-    """A scene without room and cameras that render are refused by name."""
+def test_scenes_need_room() -> None:
+    """Too few walls or landmarks are refused by name."""
     _, drawn = scenario()
     with pytest.raises(ValueError, match="num_landmarks: expected at least"):
         world.Scene.of(drawn, 500, 3)
     with pytest.raises(ValueError, match="num_walls: expected at least"):
         world.Scene.of(drawn, 2, 5000)
-    with pytest.raises(ValueError, match="sensor: expected 'landmark'"):
-        world.Hardware.of(EnvConfig(world="office", sensor="stereo"))
