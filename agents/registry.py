@@ -22,7 +22,7 @@ from agents.planners.utility_cost import utility_cost
 from agents.plugins import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
 from agents.policy import Policy
 from agents.team import Assign, Assigned, CentralPolicy, SeparatePolicies, TeamPolicy
-from agents.trained import MODEL_FILE, SUFFIX, TrainedGoalPolicy, load_model
+from agents.trained import MODEL_FILE, SUFFIX, TrainedGoalPolicy, drives, load_model, trained_policy
 from slam_backend.core.validation import argument_error, check_choice
 
 # Planners that divide the frontiers of a group among its robots, and planners of a single robot
@@ -64,7 +64,7 @@ def action_types(name: str) -> tuple[str, ...]:
         ValueError: If there is no such policy.
     """
     if is_model(name):
-        return ANY
+        return ("continuous",) if drives(name) else ANY
     if is_plugin(name):
         return (plugin_action_type(name),)
     hint = "Choose one of these names, the path of a trained model, or MODULE:NAME of a custom policy."
@@ -78,7 +78,7 @@ def make_policy(name: str, action_type: str) -> Policy:
         name: Name of the policy: one of `POLICIES`, with the action types given there; the planners among them are
             described in docs/how-to/exploration.md, and `learned` in agents/pretrained/goal.md. Path of a model of
             `vslam train`, or of its run folder: trained policy, for dict observations; it chooses goals, to which the
-            robot drives itself with other than `goal` actions.
+            robot drives itself with other than `goal` actions. A model of `vslam train-batched` drives by itself.
             `"module:Name"`: custom policy, made by calling `Name` without arguments, for its attribute `action_type`,
             or else for `goal`.
         action_type: Action type of the environment.
@@ -93,6 +93,8 @@ def make_policy(name: str, action_type: str) -> Policy:
         return RandomGoals()
     if name == "random_walk":
         return RandomWalk(action_type == "discrete")
+    if is_model(name) and drives(name):
+        return trained_policy(name, "policy")
     if name in PLANNERS:
         chooser: Policy = GoalPolicy(PLANNERS[name]())
     elif name == "learned":

@@ -1,4 +1,4 @@
-"""`TrainedGoalPolicy`: policy that evaluates a network of `vslam train` with numpy, without a learning library."""
+"""Trained policies: networks of `vslam train` and `vslam train-batched`, evaluated by numpy alone."""
 
 import hashlib
 import io
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents import driver_network
 from agents.goal_network import NAMES, SHAPES, Weights, logits, weight_shapes
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
@@ -23,6 +24,7 @@ FORMAT = 3  # incremented when the network or the meaning of observations change
 SUFFIX = ".npz"
 MODEL_FILE = "model" + SUFFIX
 ABOUT = "about"
+GOAL, DRIVER = "goal", "driver"  # networks: of goals, and of speed and turn
 OWN_GOAL = CANDIDATE_FEATURES.index("own_goal")
 
 
@@ -74,16 +76,59 @@ class TrainedGoalPolicy:
         return self._last
 
 
-def check_observation(shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse observations that do not fit the input of the network.
+class TrainedDriver:
+    """A trained policy for `continuous` actions, which decides every few ticks; a step of the environment is a tick.
+
+    It takes from the belief what the observation lacks.
+
+    Args:
+        weights: Weights of the network, as `load_model` returns them.
+        ticks: Ticks for which a decision holds, as in the training.
+        greedy: Whether to take the mean of the network's distribution; otherwise an action is drawn from it.
+    """
+
+    observation_keys = driver_network.NAMES
+
+    def __init__(self, weights: Weights, ticks: int, greedy: bool = False) -> None:
+        self._weights, self._ticks, self._greedy = weights, ticks, greedy
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last decision."""
+        self._age, self._action = 0, np.zeros(driver_network.NUM_OUTPUTS, np.float32)
+
+    def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Return speed and turn (2,) float32 in [-1, 1].
+
+        Raises:
+            ValueError: If an input of the network has another shape.
+        """
+        if self._age % self._ticks == 0:
+            named = observation if isinstance(observation, Mapping) else {}
+            missing = [name for name in driver_network.NAMES if name not in named]
+            named = {**named, **observe(belief, missing)} if missing else named
+            check_observation({name: np.shape(named[name]) for name in named}, driver_network.SHAPES)
+            batch = {name: np.asarray(named[name])[None] for name in driver_network.NAMES}
+            mean = driver_network.outputs(self._weights, batch)[0]
+            drawn = 0.0 if self._greedy else np.exp(self._weights["log_std"]) * rng.standard_normal(len(mean))
+            self._action = np.clip(mean + drawn, -1.0, 1.0).astype(np.float32)
+        self._age += 1
+        return self._action.copy()
+
+
+def check_observation(
+    shapes: Mapping[str, tuple[int, ...]], needed: Mapping[str, tuple[int, ...]] = SHAPES
+) -> None:  # fmt: skip
+    """Refuse observations that do not fit the input of a network.
 
     Args:
         shapes: Shapes of the arrays in the observation, by name.
+        needed: Shapes of the inputs, by name.
 
     Raises:
         ValueError: If an array is missing or has another shape; the message names it.
     """
-    for name, shape in SHAPES.items():
+    for name, shape in needed.items():
         if shapes.get(name) != shape:
             hint = 'Use dict observations, observation_keys="goal" and the standard scan.'
             got = f"no {name!r}" if name not in shapes else f"shape {shapes[name]}"
@@ -139,20 +184,48 @@ def load_model(path: str | Path, argument: str = "model") -> tuple[Weights, dict
         raise argument_error(
             argument, expected, "a broken file", f"{str(file)!r} was changed. Copy it again, or train again."
         )
-    _check_weights(argument, file, arrays)
+    _check_weights(argument, file, arrays, about.get("network", GOAL))
     if not isinstance(about.get("environment"), str):
         hint = f"{str(file)!r} was made by another program. Train again."
         raise argument_error(argument, "the environment of its training", "no text 'environment'", hint)
     return arrays, about
 
 
-def _check_weights(argument: str, file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def drives(path: str | Path, argument: str = "policy") -> bool:
+    """Return whether a model drives by itself, False if there is none; arguments and errors as of `load_model`."""
+    file = Path(path) / MODEL_FILE if Path(path).is_dir() else Path(path)
+    return file.is_file() and load_model(file, argument)[1].get("network", GOAL) == DRIVER
+
+
+def trained_policy(
+    path: str | Path, argument: str = "model", greedy: bool = False
+) -> TrainedGoalPolicy | TrainedDriver:
+    """Return the policy of a model; arguments and errors as of `load_model`.
+
+    Args:
+        path: Path of the model, or of the run folder that contains it.
+        argument: Name of the path in errors.
+        greedy: Whether to take the best action of the network.
+    """
+    weights, about = load_model(path, argument)
+    if about.get("network", GOAL) == DRIVER:
+        return TrainedDriver(weights, int(about["ticks"]), greedy)
+    return TrainedGoalPolicy(weights, greedy)
+
+
+def _check_weights(argument: str, file: Path, arrays: Mapping[str, NDArray[Any]], network: Any) -> None:
     """Refuse weights that are not those of the network: others, missing ones, other shapes, or no finite numbers.
 
     Raises:
         ValueError: If they are not; the message names the first.
     """
-    shapes, hint = weight_shapes(), f"{str(file)!r} was made by another program. Train again."
+    hint, known = (
+        f"{str(file)!r} was made by another program. Train again.",
+        {GOAL: weight_shapes, DRIVER: driver_network.weight_shapes},
+    )
+    if network not in known:
+        raise argument_error(argument, f"a network {' or '.join(map(repr, known))}", network, hint)
+    shapes = known[network]()
     for name in (*shapes, *arrays):
         expected = f"weights {name[:60]!r} of shape {shapes.get(name)}, float32" if name in shapes else "no others"
         if name not in shapes or name not in arrays:

@@ -32,6 +32,10 @@ COMMANDS = {
         "train", "train",
         "Train one network for all robots by PPO with masked goal actions; use it with vslam run --policy FOLDER.",
     ),
+    "train-batched": (
+        "train_batched", "train_batched",
+        "Train one driver for all robots by PPO, with many environments stepped at once; for accelerators.",
+    ),
     "evaluate": (
         "evaluate", "evaluate",
         "Compare a model with baseline policies on the same unseen worlds, with confidence intervals.",

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from training.bench.exploration.config import ExplorationConfig
-from training.bench.speed.config import EnvSpeedConfig, FilterSpeedConfig, StartSpeedConfig
+from training.bench.speed.config import BatchedSpeedConfig, EnvSpeedConfig, FilterSpeedConfig, StartSpeedConfig
 from training.commands._options import Cluster, Workers, options
 from training.commands._plan import (
     PlanName,
@@ -91,6 +91,19 @@ def speed_filter(call: Call[FilterSpeedConfig]) -> None:
 def speed_env(call: Call[EnvSpeedConfig]) -> None:
     """Time steps of environments with the filter in the loop, on one thread, with a breakdown by part."""
     from training.bench.speed.env import STUDY
+
+    run_study(call, STUDY)
+
+
+@speed.command("batched")
+@options(
+    BatchedSpeedConfig, "bench speed batched", continues=True,
+    quick={"batches": (2,), "beside": 1, "world": "fig5", "robots": 2, "rows": 64, "steps": 3},
+    quick_help="Two environments, one process, fig5, 2 robots.",
+)  # fmt: skip
+def speed_batched(call: Call[BatchedSpeedConfig]) -> None:
+    """Time batched teams on the accelerator of this machine beside processes of the environment."""
+    from training.bench.speed.batched import STUDY
 
     run_study(call, STUDY)
 

@@ -187,15 +187,17 @@ def training_environment(path: str, argument: str) -> "EnvConfig":
     Raises:
         ValueError: If the model cannot be read, or its environment cannot be made.
     """
-    from agents.trained import load_model
+    from agents.trained import DRIVER, load_model
     from slam_backend.core.validation import argument_error
     from vslam_env.config import EnvConfig
 
-    text = load_model(path, argument)[1]["environment"]
+    about = load_model(path, argument)[1]
+    action_type = "continuous" if about.get("network") == DRIVER else "goal"
     try:
-        config = EnvConfig.from_toml_text(text)
-        if config.action_type != "goal":
-            raise argument_error("action_type", "goal, as vslam train has it", config.action_type, "Check the model.")
+        config = EnvConfig.from_toml_text(about["environment"])
+        if config.action_type != action_type:
+            expected = f"{action_type}, as its training has it"
+            raise argument_error("action_type", expected, config.action_type, "Check the model.")
         return config
     except ValueError as error:
         hint = f"Train again, {str(path)!r} cannot be used: {error}"

@@ -203,7 +203,9 @@ class EvaluateConfig(ExperimentConfig):
 
     model: str = option(..., "Model of vslam train, or its run folder.", is_path=True, is_argument=True)
     policies: tuple[str, ...] = option(
-        ("random_goals", "frontier"), "Baseline policies, comma-separated; LABEL= may come before each."
+        ("random_goals", "frontier"),
+        "Baseline policies, comma-separated; LABEL= may come before each.",
+        shown="random_goals,frontier; for models that drive random_walk,frontier",
     )
     split: Literal["validation", "test"] | None = option(
         None, "Split of the worlds: validation or test.", name="world_split", shown="validation"
@@ -219,23 +221,28 @@ class EvaluateConfig(ExperimentConfig):
     seed: int = first_seed()
 
     def check(self) -> None:
-        """Refuse policies that do not exist or do not support `goal` actions, and two limits of the episode."""
+        """Refuse policies that do not exist or do not support the model's actions, and two limits of the episode."""
         from agents.registry import make_policy
+        from agents.trained import drives
         from vslam_env.config import check_one_limit
 
         check_one_limit(self.max_cycles, self.max_seconds)
         check_labels(self.policies)
+        action_type = "continuous" if drives(self.model, "model") else "goal"
         for name in self.policies:
-            make_policy(parted_label(name)[1], "goal")
+            make_policy(parted_label(name)[1], action_type)
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Refuse a configuration without a model."""
+        """Refuse a configuration without a model; models that drive have other baselines."""
+        from agents.trained import drives
         from slam_backend.core.validation import argument_error
 
         if "model" not in values:
             raise argument_error("model", "a model that vslam train wrote", "no model", "Name it, or its run folder.")
-        return values
+        if "policies" in values or not drives(values["model"], "model"):
+            return values
+        return {**values, "policies": ("random_walk", "frontier")}
 
     @classmethod
     def merged(cls, earlier: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -251,7 +258,7 @@ class EvaluateConfig(ExperimentConfig):
     def environment(self) -> "EnvConfig":
         """Return the environment. Its reward is the decrease of the map error, whatever the reward of the training.
 
-        Policies observe all keys.
+        Policies observe all keys. Those that drive act at every tick; a model holds its decisions as in its training.
 
         Raises:
             ValueError: If the model cannot be read, its environment is not supported, or a single layout has a split.
@@ -271,6 +278,10 @@ class EvaluateConfig(ExperimentConfig):
             hint = "Omit --world-split: starts and noise differ from the training anyway."
             raise argument_error("world_split", "a world family or folder", world, hint)
         changes["world_split"] = (self.split or "validation") if has_splits else None
+        if config.action_type != "goal":
+            if self.max_cycles is None and self.max_seconds is None and config.max_cycles is not None:
+                changes["max_cycles"] = config.max_cycles * config.ticks_per_step
+            changes["decision_ticks"] = None
         return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False, observation_keys="all")
 
     def trials(self) -> list[EvaluateTrial]:

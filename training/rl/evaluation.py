@@ -6,7 +6,7 @@ import numpy as np
 
 from agents.policy import Policy
 from agents.registry import make_policy
-from agents.trained import TrainedGoalPolicy, load_model
+from agents.trained import trained_policy
 from training.bench.exploration.players import label
 from training.episodes.runner import run_episode
 from training.experiments.policy_names import parted_label
@@ -39,8 +39,8 @@ def _environment(config: EvaluateConfig) -> ExplorationEnv:
 
 def _policy(config: EvaluateConfig, name: str) -> Policy:
     if name == MODEL:
-        return TrainedGoalPolicy(load_model(config.model)[0], config.greedy)
-    return make_policy(parted_label(name)[1], "goal")
+        return trained_policy(config.model, "model", config.greedy)
+    return make_policy(parted_label(name)[1], config.environment().action_type)
 
 
 def first_decision(config: EvaluateConfig) -> None:

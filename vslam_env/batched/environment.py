@@ -1,12 +1,4 @@
-"""Batched exploration with the interface of JaxMARL: pure functions of a key and a state, to be mapped by `jax.vmap`.
-
->>> from vslam_env.config import EnvConfig
->>> config = EnvConfig(world="fig5", num_robots=2, observation_keys="driver", observation_type="flat")
->>> env = BatchedExploration(config, num_worlds=1)
->>> observations, state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 4))
->>> observations["robot_1"].shape
-(4, 6998)
-"""
+"""Batched exploration with the interface of JaxMARL: pure functions of a key and a state, mapped by `jax.vmap`."""
 
 from collections.abc import Mapping
 from functools import partial

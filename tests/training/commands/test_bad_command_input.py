@@ -31,6 +31,20 @@ BAD: dict[str, dict[str, str]] = {
         "--ray auto --workers 0": "workers: expected an int >= 1 with --ray, got 0.",
         "--ray 127.0.0.1:1": "ray: expected the address of a Ray cluster that runs, got '127.0.0.1:1'.",
     },
+    "train-batched": {
+        "--robots 9": f"{ROBOTS} 9.",
+        "--world castle": "world: expected one of 'office'",
+        "--rows 3": "rows: expected an int >= 16, got 3. Use 16 rows or more.",
+        "--decision-ticks 0": "decision_ticks: expected an int >= 1, got 0.",
+        "--resume . --robots 2": "resume: expected no options that change the training, got ['robots'].",
+        "--resume full": "resume: expected the config.toml of an earlier run, got no such file.",
+    },
+    "bench speed batched": {
+        "--robots 9": f"{ROBOTS} 9.",
+        "--world castle": "world: expected one of 'office'",
+        "--batches 0": "batches: expected",
+        "--beside -1": "beside: expected an int >= 0, got -1. Use 0 for none.",
+    },
     "evaluate": {
         "": "model: expected a model that vslam train wrote, got no model",
         "none.npz": "model: expected a model that vslam train wrote, got no such file",

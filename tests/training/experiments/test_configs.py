@@ -19,6 +19,7 @@ from training.experiments.run_folder import RunFolder, read_config
 from training.paper import config as paper
 from training.paper.fig6.trials import REGIMES
 from training.replay import config as replay
+from training.rl.batched_config import BatchedTrainConfig
 from training.rl.config import TRAIN_PRESETS, EvaluateConfig, TrainConfig
 from training.stereo_runs import runs
 from vslam_env.config import ACTION_TYPES, MAX_ROBOTS, SENSORS
@@ -32,6 +33,8 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     exploration.ExplorationConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     speed.FilterSpeedConfig: {"proposals": ("fastslam1",), "large": True},
     exploration.PlanConfig: {"plan": "vslam-bench-v0", "policies": ("frontier",), "quick": True},
+    speed.BatchedSpeedConfig: {"batches": (8, 16), "rows": 64},
+    BatchedTrainConfig: {"world": "maze", "batch": 64, "minutes": 4.0, "learning_rate": 1e-3},
     speed.StartSpeedConfig: {"parts": ("import",), "repeats": 1}, stereo.Config: {"descriptors": ("orb",)},
     training_speed.Config: {"workers": (0, 2)},
     mrclam_pairs.Config: {"path": "log", "durations": (50.0,)},
@@ -80,6 +83,12 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
     exploration.PlanConfig: {
         "decision_limit": {0.0: ABOVE_0}, "quick": {1: "a bool"}, "plan": {3: "a text"},
         "policies": {("frontier", "frontier"): "at least one value, each once"},
+    },
+    speed.BatchedSpeedConfig: {"rows": {3: "an int >= 16"}, "beside": {-1: AT_LEAST_0}, "batches": {(0,): AT_LEAST_1}},
+    BatchedTrainConfig: {
+        "rows": {3: "an int >= 16"}, "batch": {0: AT_LEAST_1}, "minutes": {0.0: ABOVE_0}, "robots": {9: ROBOTS},
+        "minibatches": {7: "a divisor of batch x steps, 2048"}, "gamma": {1.5: "a finite number > 0 and <= 1"},
+        "preset": {"calm": "one of 'easy'"}, "std": {0.0: ABOVE_0},
     },
     speed.StartSpeedConfig: {"repeats": {0: AT_LEAST_1}, "parts": {("none",): "one of"}},
     stereo.Config: {

@@ -78,6 +78,24 @@ class FilterSpeedConfig(ExperimentConfig):
         ]
 
 
+class BatchedSpeedConfig(ExperimentConfig):
+    """Benchmark of batched teams beside processes of the environment; all drive at random."""
+
+    batches: tuple[Positive, ...] = option((1024,), "Numbers of environments of a batch.")
+    beside: int = option(
+        16, "Number of processes of the environment to compare with; 0: none.", ge=0, hint="Use 0 for none."
+    )
+    world: str = option("office", "World family or path.")
+    robots: int = option(3, "Number of robots K, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
+    rows: int = option(
+        384, "Number of landmarks for which the belief of a team has room.", ge=16, hint="Use 16 rows or more."
+    )
+    decision_ticks: Positive = option(10, "Ticks of 0.1 s per step.")
+    steps: Positive = option(60, "Number of steps of an episode.")
+    num_worlds: Positive = option(64, "Largest number of worlds of a batch.")
+    seed: int = option(100, "Seed of the episodes.", ge=0, hint="Use 0 or a positive number.")
+
+
 class StartSpeedConfig(ExperimentConfig):
     """The start-up bench: what a user waits for at first."""
 
