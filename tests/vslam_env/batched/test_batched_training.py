@@ -11,6 +11,8 @@ from scipy.stats import norm
 
 from agents import make_policy
 from agents.driver_network import SHAPES, outputs, weight_shapes
+from training.bench.speed import batched
+from training.bench.speed.config import BatchedSpeedConfig
 from training.rl.batched_config import BatchedTrainConfig
 
 ppo = pytest.importorskip("training.rl.batched_ppo")
@@ -20,24 +22,40 @@ CONFIG = BatchedTrainConfig(
 )  # fmt: skip
 
 
+class Part(NamedTuple):
+    """Something with a part."""
+
+    episode: Any = None
+    belief: Any = None
+    covariance: Any = None
+
+
 class Toy(NamedTuple):
     """Environment of two robots that are rewarded for driving slowly ahead; episodes take four steps."""
 
     agents: tuple[str, ...] = ("robot_0", "robot_1")
     num_agents: int = 2
+    broken: float = 0.0
 
     def reset(self, key: Any) -> Any:
-        """Return observations of nothing, and the step."""
+        """Return observations of nothing, and the step as all that there is."""
         seen = {name: jnp.zeros(shape) for name, shape in SHAPES.items()}
-        return {agent: dict(seen) for agent in self.agents}, jnp.zeros((), jnp.int32)
+        return {agent: dict(seen) for agent in self.agents}, self._state(jnp.zeros(()))
+
+    def check_batch(self, batch: int) -> None:
+        """All batches fit."""
+
+    def _state(self, step: Any) -> Any:
+        return Part(episode=Part(belief=Part(covariance=step)))
 
     def step(self, key: Any, state: Any, actions: Any) -> Any:
         """Return what follows."""
-        is_over = state >= 3
+        before = state.episode.belief.covariance
+        is_over = before >= 3
         rewards = {agent: -((actions[agent][0] - 0.6) ** 2) for agent in self.agents}
         infos = {"map_error": jnp.array([0.2, 0.4]), "map_recall": jnp.ones(2), "group": jnp.array([0, 0])}
-        after = jnp.where(is_over, 0, state + 1)
-        return self.reset(key)[0], after, rewards, {"__all__": is_over}, infos
+        value = jnp.where(is_over, 0.0, before + 1.0) / jnp.where(jax.random.uniform(key) < self.broken, 0.0, 1.0)
+        return self.reset(key)[0], self._state(value), rewards, {"__all__": is_over}, infos
 
 
 def trained(folder: Path, updates: int) -> Any:
@@ -119,3 +137,14 @@ def test_advantages_are_returns_or_surprises(lam: float) -> None:
         following = further if lam else after
         expected[t] = rewards[t] + 0.9 * following * (1.0 - dones[t]) - values[t]
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("broken", [0.0, 1.0])
+def test_the_bench_counts_episodes_with_numbers_that_are_none(monkeypatch: pytest.MonkeyPatch, broken: float) -> None:
+    """All episodes of all plays count once; the rate is that of all ticks."""
+    monkeypatch.setattr("vslam_env.batched.environment.BatchedExploration", lambda *_, **__: Toy(broken=broken))
+    config = BatchedSpeedConfig(batches=(3,), beside=0, steps=4, plays=2)
+    told = batched.play(config, batched.trials(config)[0])
+    assert told["not_finite"] == (6 if broken else 0)
+    assert told["ticks_per_second"] > 0.0
+    assert told["compile_s"] > 0.0

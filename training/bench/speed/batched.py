@@ -45,8 +45,8 @@ def play(config: BatchedSpeedConfig, trial: Trial) -> dict[str, Any]:
     """Time random driving from the starts on; compiling and resets are not in the rate.
 
     Returns:
-        `ticks_per_second` of all environments together; of batched ones also `compile_s` and `memory_gb`, of all
-        states and what a step adds.
+        `ticks_per_second` of all environments together; of batched ones also `compile_s`, `memory_gb` of all states and
+        what a step adds, and the number `not_finite` of episodes with a number that is none.
     """
     if trial.kind == EXACT:
         return {"ticks_per_second": _exact(config, trial.number)}
@@ -77,6 +77,7 @@ def _drive(config: BatchedSpeedConfig, seed: int) -> tuple[float, float]:
 def _batched(config: BatchedSpeedConfig, batch: int) -> dict[str, Any]:
     """Return figures of a batch."""
     import jax
+    import jax.numpy as jnp
 
     from vslam_env.batched.environment import BatchedExploration
 
@@ -92,24 +93,29 @@ def _batched(config: BatchedSpeedConfig, batch: int) -> dict[str, Any]:
             for agent, own in zip(env.agents, jax.random.split(of_actions, len(env.agents)), strict=True)
         }
         observed, state, rewards, *_ = jax.vmap(env.step)(jax.random.split(of_step, batch), state, actions)
-        read = sum(values.astype("float32").mean() for values in jax.tree.leaves((observed, rewards)))
-        return state, read  # all observations count
+        parts = jax.tree.leaves((observed, rewards, state.episode.belief.covariance))
+        sums = sum(values.reshape(batch, -1).astype("float32").sum(axis=1) for values in parts)
+        return state, jnp.isfinite(sums)  # all observations count
 
     begin = time.perf_counter()
-    _, state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(config.seed), batch))
+    reset = jax.jit(jax.vmap(env.reset))
     run: Callable[..., Any] = jax.jit(partial(jax.lax.scan, decide), donate_argnums=0)
-    keys = jax.random.split(jax.random.key(1), config.steps)
-    compiled = run.lower(state, keys).compile()  # type: ignore[attr-defined]
-    jax.block_until_ready(state)
-    compile_s = time.perf_counter() - begin
+    keys = jax.random.split(jax.random.key(config.seed), (config.plays, config.steps))
+    _, state = reset(jax.random.split(jax.random.key(0), batch))
+    compiled = run.lower(state, keys[0]).compile()  # type: ignore[attr-defined]
+    compile_s, seconds, not_finite = time.perf_counter() - begin, 0.0, 0
+    for play, of_steps in enumerate(keys):
+        _, state = jax.block_until_ready(reset(jax.random.split(jax.random.key(play), batch)))
+        begin = time.perf_counter()
+        _, is_finite = jax.block_until_ready(compiled(state, of_steps))
+        seconds += time.perf_counter() - begin
+        not_finite += int((~is_finite).any(axis=0).sum())
     told = compiled.memory_analysis()
     memory = sum(getattr(told, f"{part}_size_in_bytes", 0) for part in ("argument", "output", "temp")) if told else 0
-    begin = time.perf_counter()
-    jax.block_until_ready(compiled(state, keys))
-    seconds = time.perf_counter() - begin
+    ticks = config.plays * batch * config.steps * config.decision_ticks
     return {
-        "ticks_per_second": batch * config.steps * config.decision_ticks / seconds, "compile_s": compile_s,
-        "memory_gb": memory / 1e9,
+        "ticks_per_second": ticks / seconds, "compile_s": compile_s, "memory_gb": memory / 1e9,
+        "not_finite": not_finite,
     }  # fmt: skip
 
 
@@ -130,7 +136,7 @@ STUDY = Study(
             name="speed", title="Simulated ticks of 0.1 s a second, all environments together", by=("kind", "number"),
             columns=(
                 Column("ticks_per_second", "ticks/s", digits=0), Column("compile_s", "compiling [s]", digits=0),
-                Column("memory_gb", "memory [GB]", digits=2),
+                Column("memory_gb", "memory [GB]", digits=2), Column("not_finite", "not finite", "sum", digits=0),
             ),
         ),
     ),

@@ -92,6 +92,7 @@ class BatchedSpeedConfig(ExperimentConfig):
     )
     decision_ticks: Positive = option(10, "Ticks of 0.1 s per step.")
     steps: Positive = option(60, "Number of steps of an episode.")
+    plays: Positive = option(2, "Number of episodes of each environment of a batch.")
     num_worlds: Positive = option(64, "Largest number of worlds of a batch.")
     seed: int = option(100, "Seed of the episodes.", ge=0, hint="Use 0 or a positive number.")
 
