@@ -21,3 +21,17 @@ def test_the_tests_with_jax_pass_in_a_process_of_their_own() -> None:
     done = subprocess.run([*command, *ignored], env=environment, capture_output=True, text=True, timeout=900.0)
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
     assert "skipped" not in done.stdout
+
+
+def test_a_missing_package_is_one_line_that_names_the_extra() -> None:
+    """Imports of batched teams and their commands say what to install."""
+    hidden = "import sys; sys.modules['jax'] = None; "
+    program = f"{hidden}import vslam_env.batched.environment"
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100.0).stderr
+    assert said.splitlines()[-1].endswith('Install the extra: pip install "vslam-env[jax]".')
+    for words in (["train-batched", "--quick"], ["bench", "speed", "batched", "--quick"]):
+        program = f"{hidden}sys.argv = ['vslam', *{words!r}]; from training.cli import main; main()"
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100.0)
+        assert done.returncode == 2, done.stderr
+        (line,) = done.stderr.splitlines()
+        assert line.startswith("error packages: expected jax, optax, got no jax. Install the extra: pip install ")
