@@ -198,7 +198,7 @@ class BatchedTraining:
         write_file(self._folder / CHECKPOINT_FILE, packed.getvalue(), "out")
 
     def restore(self) -> None:
-        """Continue from the checkpoint of the folder; episodes begin anew.
+        """Continue from the checkpoint of the folder, with new episodes.
 
         Raises:
             ValueError: If it is missing or broken, or belongs to another configuration.
