@@ -1,5 +1,6 @@
 """PPO of batched teams: its terms, what it learns in a toy world, and its files."""
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from scipy.stats import norm
 
 from agents import make_policy
 from agents.driver_network import SHAPES, outputs, weight_shapes
+from training import cli
 from training.bench.speed import batched
 from training.bench.speed.config import BatchedSpeedConfig
 from training.rl.batched_config import BatchedTrainConfig
@@ -148,3 +150,29 @@ def test_the_bench_counts_episodes_with_numbers_that_are_none(monkeypatch: pytes
     assert told["not_finite"] == (6 if broken else 0)
     assert told["ticks_per_second"] > 0.0
     assert told["compile_s"] > 0.0
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    """Call the command line, and return its exit status."""
+    monkeypatch.setattr("sys.argv", ["vslam", *words])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def test_commands_write_what_they_print(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The file of --json is the `metrics.json` of both commands; a complete training resumes to its end."""
+    monkeypatch.setattr("vslam_env.batched.environment.BatchedExploration", lambda *_, **__: Toy())
+    monkeypatch.setattr(ppo, "make_env", lambda config: Toy())
+    driver, rate, copy = tmp_path / "driver", tmp_path / "rate", tmp_path / "copy.json"
+    for folder, words in {driver: ("train-batched",), rate: ("bench", "speed", "batched", "--beside", "0")}.items():
+        given = "--quick", "--out", str(folder), "--json", str(copy)
+        assert called(monkeypatch, *words, *given) == 0, capsys.readouterr().err
+        assert copy.read_text() == (folder / "metrics.json").read_text()
+    names = {file.name for file in driver.iterdir()}
+    assert {"model.npz", "checkpoint.npz", "curves.csv", "learning.png", "report.html"} <= names
+    assert json.loads((driver / "metrics.json").read_text())["complete"]
+    assert called(monkeypatch, "train-batched", "--resume", str(driver)) == 0, capsys.readouterr().err
+    assert "Next: vslam evaluate" in capsys.readouterr().out
