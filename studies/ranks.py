@@ -6,7 +6,6 @@ python -m studies.ranks --world office --policies random,spin,wall,frontier,runs
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.stats import kendalltau
 from agents.driver_network import outputs
 from agents.trained import load_model
 from slam_backend.core.validation import FloatArray, argument_error
+from training.bench.exploration.players import label
 from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, NoisePreset, RobotCount, first_seed, option
 from training.experiments.study import Column, ResultTable, Row, Study
@@ -209,7 +209,7 @@ STUDY = Study(
     tables=(
         ResultTable(
             name="errors", title="Map error E [m] at the end", by=("policy",),
-            words={"policy": ("policy", lambda name: Path(name).stem)},
+            words={"policy": ("policy", label)},
             columns=(
                 Column("exact", "environment", interval=True), Column("batched", "batched", interval=True),
             ),

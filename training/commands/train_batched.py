@@ -96,7 +96,8 @@ def _run_live(call: Call[BatchedTrainConfig], training: "BatchedTraining") -> bo
 
         while not is_over() and not interrupted():
             row = training.update()
-            bar.update(task, completed=len(training.rows), status=f"E {row['map_error']:.3f} m")
+            status = f"E {row['map_error']:.3f} m" if row["episodes"] else "no episode ended in this rollout"
+            bar.update(task, completed=len(training.rows), status=status)
             if len(training.rows) % config.checkpoint_updates == 0:
                 training.save()
         if training.rows:
@@ -109,7 +110,7 @@ def _finish(call: Call[BatchedTrainConfig], training: "BatchedTraining", complet
     from training.experiments.tables import csv_of
     from training.rl.curves import draw_learning, first_and_last_tenth
 
-    rows, folder = training.rows, call.folder
+    rows, folder = [row for row in training.rows if row["episodes"]], call.folder
     metrics: dict[str, Any] = {"complete": complete, "seconds_this_time": seconds}
     if rows:
         folder.write_text("curves.csv", csv_of(rows))
@@ -118,4 +119,4 @@ def _finish(call: Call[BatchedTrainConfig], training: "BatchedTraining", complet
     call.write(metrics)
     call.finish()
     text = f"vslam evaluate {folder.path}" if complete else f"vslam train-batched --resume {folder.path}"
-    call.console.print(f"Next: {text}" if rows else "Stopped before the first rollout: nothing was saved.")
+    call.console.print(f"Next: {text}" if training.rows else "Stopped before the first rollout: nothing was saved.")

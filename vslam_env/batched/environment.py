@@ -23,7 +23,7 @@ from vslam_env.navigation.planning import MAX_SPEED, MAX_TURN
 from vslam_env.simulation.memory import available_memory
 from vslam_env.simulation.scenario import sample_scenario
 
-COPIES = 4  # of a state that a compiled step holds at once
+COPIES = 6  # of a state that a compiled step holds at once
 
 Observations = dict[str, Any]
 
