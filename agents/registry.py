@@ -22,7 +22,7 @@ from agents.planners.utility_cost import utility_cost
 from agents.plugins import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
 from agents.policy import Policy
 from agents.team import Assign, Assigned, CentralPolicy, SeparatePolicies, TeamPolicy
-from agents.trained import MODEL_FILE, SUFFIX, TrainedGoalPolicy, drives, load_model, trained_policy
+from agents.trained import MODEL_FILE, SUFFIX, TrainedDriver, TrainedGoalPolicy, drives, load_model, trained_policy
 from slam_backend.core.validation import argument_error, check_choice
 
 # Planners that divide the frontiers of a group among its robots, and planners of a single robot
@@ -93,14 +93,14 @@ def make_policy(name: str, action_type: str) -> Policy:
         return RandomGoals()
     if name == "random_walk":
         return RandomWalk(action_type == "discrete")
-    if is_model(name) and drives(name):
-        return trained_policy(name, "policy")
     if name in PLANNERS:
         chooser: Policy = GoalPolicy(PLANNERS[name]())
     elif name == "learned":
         chooser = TrainedGoalPolicy(_shipped_weights(), greedy=True)
     else:
-        chooser = TrainedGoalPolicy(load_model(name)[0])
+        chooser = trained_policy(name)
+    if isinstance(chooser, TrainedDriver):
+        return chooser
     if action_type == "goal":
         return chooser
     return DrivingPolicy(chooser, action_type == "discrete", name not in PLANNERS or name in SWEEPING)

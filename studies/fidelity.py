@@ -18,12 +18,13 @@ from slam_backend.core.validation import FloatArray, argument_error
 from slam_backend.geometry import between
 from studies import losses
 from studies.bounds.episodes import RecordedEpisode, record_episode
-from studies.bounds.gaussian_team import GaussianTeam, check_jax, gaussian_team, simulated_team
+from studies.bounds.gaussian_team import GaussianTeam, gaussian_team, simulated_team
 from training.bench.exploration.players import parted
 from training.commands.study import run_program
 from training.episodes.guard import GuardedTeam
 from training.experiments.config import NoisePreset, RobotCount, option
 from training.experiments.study import Column, ResultTable, Row, Study
+from training.rl.config import require_extra
 from vslam_env import vslam_v1
 from vslam_env.belief.team_belief import Belief
 from vslam_env.config import TICK, EnvConfig
@@ -64,7 +65,7 @@ class Config(losses.Config):
     def check(self) -> None:
         """Refuse what the episodes refuse, and a missing package."""
         if not set(self.estimators) <= OPTIONS.keys():
-            check_jax()
+            require_extra("jax")
         goals = [policy for policy in self.policies if parted(policy).action_type == "goal"]
         if "batched" in self.estimators and goals:
             raise argument_error("policy", "policies with @continuous or @discrete", goals[0], "Or omit batched.")

@@ -19,7 +19,7 @@ from training.bench.exploration.players import label
 from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, NoisePreset, RobotCount, first_seed, option
 from training.experiments.study import Column, ResultTable, Row, Study
-from training.rl.batched_config import require_jax
+from training.rl.config import require_extra
 from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 from vslam_env.navigation import CELL
@@ -113,7 +113,7 @@ class Config(ExperimentConfig):
             raise argument_error("policies", "at least two", self.policies, "One has no rank.")
         for name in self.policies:
             driver(name)
-        require_jax()
+        require_extra("jax")
         environment(self)
 
 

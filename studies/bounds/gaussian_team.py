@@ -2,13 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, argument_error
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import between, wrap_angle
 from studies.bounds.episodes import RecordedEpisode
 from training.episodes.runner import is_false_merge
@@ -53,12 +52,6 @@ class Part(NamedTuple):
     poses: FloatArray
     groups: Any
     scores: Any
-
-
-def check_jax() -> None:
-    """Raise if the package is missing."""
-    if find_spec("jax") is None:
-        raise argument_error("jax", "the package jax", "no such package", 'Install it: pip install "jax>=0.5".')
 
 
 def gaussian_team(episode: RecordedEpisode) -> GaussianTeam:

@@ -74,6 +74,26 @@ class Call(Generic[ConfigT]):
         """Validated configuration."""
         return self.kind.from_mapping(self.values)
 
+    def resumed(self, folder: Path, others: str) -> ConfigT:
+        """Return the configuration of a stopped training.
+
+        Args:
+            folder: Run folder to resume.
+            others: Options that may be given beside it.
+
+        Raises:
+            ValueError: If options would change the configuration, or it cannot be read.
+        """
+        from slam_backend.core.validation import argument_error
+        from training.experiments.run_folder import read_config
+
+        given = [*self.given, *(name for name, value in (("out", self.out), ("config", self.file)) if value)]
+        if given:
+            hint = f"A resumed training keeps its configuration; omit all but {others}."
+            raise argument_error("resume", "no options that change the training", given, hint)
+        values, seed = read_config(folder, self.command, "resume")
+        return self.kind.from_mapping(values | {"seed": seed})
+
     def begin(
         self, *first_steps: Callable[[], object], config: ExperimentConfig | None = None
     ) -> tuple[Console, "RunFolder"]:

@@ -57,7 +57,7 @@ def train(
     """
     from slam_backend.core.validation import argument_error, check_int
     from training.experiments.cluster import LostWorkerError, connected
-    from training.experiments.run_folder import RunFolder, installed_versions, read_config
+    from training.experiments.run_folder import RunFolder, installed_versions
 
     require_extra()
     from training.rl.checkpoint import check_device, stored_checkpoint
@@ -72,12 +72,7 @@ def train(
     if resume is None:
         chosen = call.config
     else:
-        others = [*call.given, *(name for name, value in (("out", call.out), ("config", call.file)) if value)]
-        if others:
-            hint = "A resumed training keeps its configuration; omit all but --workers, --ray, --device and --json."
-            raise argument_error("resume", "no options that change the training", others, hint)
-        values, seed = read_config(resume, call.command, "resume")
-        chosen = TrainConfig.from_mapping(values | {"seed": seed})
+        chosen = call.resumed(resume, "--workers, --ray, --device and --json")
         kept = stored_checkpoint(resume, chosen)  # detects a bad checkpoint before kernels are compiled
     if ray is not None:
         with connected(ray):  # detects a bad address before the folder is created

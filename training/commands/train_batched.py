@@ -9,7 +9,8 @@ import typer
 from training.commands._options import options
 from training.commands._run_folder import Call
 from training.experiments.console import text_column
-from training.rl.batched_config import BatchedTrainConfig, require_jax
+from training.rl.batched_config import BatchedTrainConfig
+from training.rl.config import require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.rl.batched_ppo import BatchedTraining
@@ -36,9 +37,8 @@ def train_batched(
     Ctrl-C stops after the current rollout and saves. --resume FOLDER continues from the last checkpoint with new
     episodes.
     """
-    from slam_backend.core.validation import argument_error
     from training.experiments.compilation import prepare
-    from training.experiments.run_folder import RunFolder, installed_versions, read_config
+    from training.experiments.run_folder import RunFolder, installed_versions
 
     made: list[BatchedExploration] = []
 
@@ -48,15 +48,9 @@ def train_batched(
 
         made.append(make_env(chosen))
 
-    chosen = call.config
-    require_jax()
+    chosen = call.config if resume is None else call.resumed(resume, "--json")
+    require_extra("jax")
     if resume is not None:
-        others = [*call.given, *(name for name, value in (("out", call.out), ("config", call.file)) if value)]
-        if others:
-            hint = "A resumed training keeps its configuration; omit all but --json."
-            raise argument_error("resume", "no options that change the training", others, hint)
-        values, seed = read_config(resume, call.command, "resume")
-        chosen = BatchedTrainConfig.from_mapping(values | {"seed": seed})
         prepare(draw_worlds)
         call.folder = RunFolder(resume, call.command, chosen.to_mapping(), chosen.seed, installed_versions())
     else:

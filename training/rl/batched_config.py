@@ -1,6 +1,5 @@
 """`BatchedTrainConfig`: configuration of the training of batched teams on an accelerator, and its environment."""
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from training.experiments.config import ExperimentConfig, NoisePreset, Positive, option, setting
@@ -8,8 +7,6 @@ from training.rl.config import ONE, SPLIT_TRAIN, Share
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from vslam_env.config import EnvConfig
-
-NEEDED = ("jax", "optax")
 
 
 class BatchedTrainConfig(ExperimentConfig):
@@ -62,17 +59,3 @@ class BatchedTrainConfig(ExperimentConfig):
             num_robots=self.robots, action_type="continuous", decision_ticks=self.decision_ticks,
             max_seconds=self.duration, observation_keys="driver",
         )  # fmt: skip
-
-
-def require_jax() -> None:
-    """Refuse to continue without the packages of the extra `jax`.
-
-    Raises:
-        ValueError: If a package is missing.
-    """
-    from slam_backend.core.validation import argument_error
-
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        hint = 'Install the extra: pip install "vslam-env[jax]", and jax[cuda12] for an accelerator.'
-        raise argument_error("packages", ", ".join(NEEDED), f"no {missing[0]}", hint)

@@ -15,7 +15,13 @@ if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that
     from vslam_env.config import EnvConfig
 
 SPLIT_TRAIN, SPLIT_TRY = "train", "validation"
-NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard")
+EXTRAS = {  # packages of the extras for training, and how they are installed
+    "train": (
+        ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
+        "Install them: pip install torch==2.13.0, then pip install '.[train]' in a checkout.",
+    ),
+    "jax": (("jax", "optax"), 'Install them: pip install "vslam-env[jax]", and jax[cuda12] for an accelerator.'),
+}
 MODEL = "model"
 LEARNED = "learned"  # the shipped model
 ONE = "Give a number >= 1."
@@ -290,15 +296,15 @@ class EvaluateConfig(ExperimentConfig):
         return [EvaluateTrial(name, seed) for seed in range(self.seed, self.seed + self.seeds) for name in names]
 
 
-def require_extra() -> None:
-    """Refuse to continue without the packages of the extra `train`.
+def require_extra(extra: str = "train") -> None:
+    """Refuse to continue without the packages of an extra of `EXTRAS`.
 
     Raises:
         ValueError: If a package is missing.
     """
     from slam_backend.core.validation import argument_error
 
-    missing = [name for name in NEEDED if find_spec(name) is None]
+    needed, hint = EXTRAS[extra]
+    missing = [name for name in needed if find_spec(name) is None]
     if missing:
-        hint = "Install them: pip install torch==2.13.0, then pip install '.[train]' in a checkout."
-        raise argument_error("train", "the packages of the extra 'train'", f"no {', '.join(missing)}", hint)
+        raise argument_error(extra, f"the packages of the extra {extra!r}", f"no {', '.join(missing)}", hint)

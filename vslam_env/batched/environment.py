@@ -13,7 +13,7 @@ from slam_backend.core.validation import argument_error, check_int
 from vslam_env.actions import DISCRETE_COMMANDS, MAX_REVERSE
 from vslam_env.batched import episode as episodes
 from vslam_env.batched.episode import Episode, Rules
-from vslam_env.batched.observation import relative
+from vslam_env.batched.observation import in_start_frame, relative
 from vslam_env.batched.world import Scene
 from vslam_env.belief._observation_kernels import GRID_ON
 from vslam_env.belief.observation import GRIDS, flatten
@@ -262,7 +262,8 @@ class BatchedExploration:
     def _infos(self, episode: Episode, scene: Scene) -> dict[str, Array]:
         belief, scores = episode.belief, episode.scores
         away = jax.vmap(relative)(scene.starts, episode.poses)[:, :2]
-        believed = jax.vmap(relative)(belief.robots[:, 5:], belief.robots[:, :3])[:, :2]
+        robots = jnp.arange(self.num_agents)
+        believed = jax.vmap(in_start_frame, (None, 0, 0))(belief.robots, robots, robots)[:, :2]
         confirmed = belief.counts >= self.rules.confirm_after
         return {
             "map_error": scores.map_errors, "map_rmse": scores.map_rmses, "map_recall": scores.map_recalls,

@@ -95,7 +95,7 @@ def test_only_families_have_splits(tmp_path: Path) -> None:
 
 def test_missing_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the extra, training names the packages to install."""
-    monkeypatch.setattr(learn_extra, "NEEDED", ("numpy", "a_missing_package"))
+    monkeypatch.setitem(learn_extra.EXTRAS, "train", (("numpy", "a_missing_package"), "Install them."))
     with pytest.raises(
         ValueError, match=r"train: expected the packages of the extra 'train', got no a_missing_package"
     ):

@@ -12,7 +12,7 @@ import numpy as np
 
 from training.bench.speed.config import BatchedSpeedConfig
 from training.experiments.study import Column, ResultTable, Study
-from training.rl.batched_config import require_jax
+from training.rl.config import require_extra
 from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 
@@ -121,7 +121,7 @@ def _batched(config: BatchedSpeedConfig, batch: int) -> dict[str, Any]:
 
 def checks(config: BatchedSpeedConfig) -> list[Callable[[], object]]:
     """Return the check for the packages, and the construction of the environment."""
-    return [require_jax, partial(vslam_v1.parallel_env, config=environment(config))]
+    return [partial(require_extra, "jax"), partial(vslam_v1.parallel_env, config=environment(config))]
 
 
 STUDY = Study(
