@@ -34,6 +34,4 @@ def test_a_missing_package_is_one_line_that_names_the_extra() -> None:
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100.0)
         assert done.returncode == 2, done.stderr
         (line,) = done.stderr.splitlines()
-        assert line.startswith(
-            "error jax: expected the packages of the extra 'jax', got no jax. Install them: "
-        )
+        assert line.startswith("error jax: expected the packages of the extra 'jax', got no jax. Install them: ")
