@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.goal_network import CHANNELS, GRID_SCALE, PATCHES, TEAMMATE_SCALE, VECTORS
+from agents.goal_network import CHANNELS, PATCHES, scaled
 from agents.goal_network import SHAPES as GOAL_SHAPES
 
 NAMES = ("local_grid", "pose_std", "map_stats", "scan", "teammates", "teammates_mask")
@@ -41,7 +41,7 @@ def outputs(weights: Mapping[str, Any], observations: Mapping[str, Any], xp: Any
         observations: Arrays (n, ...) by name, as robots observe them.
         xp: Module of the arrays, `numpy` or `jax.numpy`.
     """
-    picture = observations["local_grid"] * xp.float32(GRID_SCALE)
+    picture = scaled(observations, "local_grid", xp)
     count, depth, size, _ = picture.shape
     picture = xp.moveaxis(picture, 1, -1)
     for i, side in enumerate(PATCHES):
@@ -50,11 +50,7 @@ def outputs(weights: Mapping[str, Any], observations: Mapping[str, Any], xp: Any
         patches = xp.moveaxis(patches, 2, 3).reshape(count, size, size, side * side * depth)
         picture = xp.maximum(patches @ weights[f"picture.{i}.weight"] + weights[f"picture.{i}.bias"], 0.0)
         depth = CHANNELS[i]
-    scales = VECTORS | {"teammates": TEAMMATE_SCALE}
-    vectors = [
-        (observations[name] * xp.asarray(scales.get(name, (1.0,)), dtype=xp.float32)).reshape(count, -1)
-        for name in NAMES[1:]
-    ]
+    vectors = [scaled(observations, name, xp).reshape(count, -1) for name in NAMES[1:]]
     hidden = xp.concatenate([picture.reshape(count, -1), *vectors], axis=1)
     last = len(HIDDEN)
     for i in range(last):

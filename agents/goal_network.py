@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import BoolArray, Float32Array, IntArray
+from vslam_env.belief.observation_keys import SCALES
 from vslam_env.navigation import CANDIDATE_FEATURES, NUM_CANDIDATES
 
 Weights = Mapping[str, Float32Array]
@@ -30,29 +31,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "action_mask": (1 + NUM_CANDIDATES,),
 }
 NAMES = tuple(SHAPES)
-# Factors that scale the input vectors to the order of one.
-VECTORS: dict[str, tuple[float, ...]] = {
-    "pose_std": (2.0, 2.0, 10.0),
-    "map_stats": (0.01, 5.0, 5.0, 0.1, 1.0, 0.25),
-    "scan": (0.125,),
-    "landmark_counts": (0.02,),
-    "time_left": (0.01,),
-}
-FEATURE_SCALES: dict[str, float] = {
-    "x": 0.1,
-    "y": 0.1,
-    "path_length": 0.1,
-    "size": 0.25,
-    "teammate_path_length": 1.0 / 60.0,
-    "unknown_area": 0.05,
-    "unseen_wall": 0.25,
-    "weak_landmarks": 0.25,
-    "uncertain_length": 0.1,
-    "nearest_candidate": 0.1,
-}  # 1 for the others
-CANDIDATE_SCALE = tuple(FEATURE_SCALES.get(name, 1.0) for name in CANDIDATE_FEATURES)
-TEAMMATE_SCALE = (0.1, 0.1, 1.0, 1.0, 2.0)
-GRID_SCALE = 1.0 / 255.0
+VECTORS = ("pose_std", "map_stats", "scan", "landmark_counts", "time_left")  # of the robot
 PATCHES = (4, 3)  # sides of the non-overlapping patches of each convolution
 CHANNELS = (16, 32)
 WIDTH = 64  # of a token
@@ -63,6 +42,11 @@ EPSILON = 1e-5  # added to variances by the normalisation
 INVALID = -1e8  # logit of an invalid action
 VECTOR_SIZE = sum(int(np.prod(SHAPES[name])) for name in VECTORS)
 PICTURE_SIZE = CHANNELS[1] * (48 // (PATCHES[0] * PATCHES[1])) ** 2
+
+
+def scaled(observations: Mapping[str, Any], name: str, xp: Any = np) -> Any:
+    """Return an array of observations in the order of one, float32, in numpy or in jax (`xp`)."""
+    return observations[name] * xp.asarray(SCALES[name], dtype=xp.float32)
 
 
 def weight_shapes() -> dict[str, tuple[int, ...]]:
@@ -98,16 +82,16 @@ def logits(weights: Weights, observations: Mapping[str, NDArray[Any]]) -> Float3
         weights: Weights by the layer names of the learner.
         observations: (n, ...) arrays by name, as the environment returns them.
     """
-    picture = observations["local_grid"] * np.float32(GRID_SCALE)
+    picture = scaled(observations, "local_grid")
     n = len(picture)
     for layer, patch in enumerate(PATCHES):
         picture = np.maximum(_convolve(picture, weights, f"picture.{2 * layer}", patch), 0.0)
-    vectors = [(observations[name] * np.array(scale, np.float32)).reshape(n, -1) for name, scale in VECTORS.items()]
+    vectors = [scaled(observations, name).reshape(n, -1) for name in VECTORS]
     robot = _linear(weights, "robot", np.concatenate([picture.reshape(n, -1), *vectors], axis=1))
     is_valid, is_mate = observations["action_mask"][:, 1:] != 0, observations["teammates_mask"] != 0
     present = np.concatenate([np.ones((n, 1), np.bool_), is_valid, is_mate], axis=1)
-    slots = _linear(weights, "candidate", observations["candidates"] * np.array(CANDIDATE_SCALE, np.float32))
-    mates = _linear(weights, "teammate", observations["teammates"] * np.array(TEAMMATE_SCALE, np.float32))
+    slots = _linear(weights, "candidate", scaled(observations, "candidates"))
+    mates = _linear(weights, "teammate", scaled(observations, "teammates"))
     tokens = np.concatenate([robot[:, None], slots, mates], axis=1)[present]
     row, place = np.nonzero(present)[0], (present.cumsum(axis=1) - 1)[present]
     size = int(present.sum(axis=1).max())
@@ -152,8 +136,8 @@ def _attention(
 def _normalised(weights: Weights, name: str, tokens: NDArray[Any]) -> NDArray[Any]:
     """Scale tokens to mean 0 and variance 1, and then by the weights."""
     centred = tokens - tokens.mean(axis=-1, keepdims=True)
-    scaled = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(EPSILON))
-    normalised: NDArray[Any] = scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+    divided = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(EPSILON))
+    normalised: NDArray[Any] = divided * weights[f"{name}.weight"] + weights[f"{name}.bias"]
     return normalised
 
 

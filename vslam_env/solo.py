@@ -24,6 +24,8 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
     Args:
         render_mode: `"human"`, `"rgb_array"` or None.
         version: 1, or 0 for all keys of observations by default.
+        wrap: Function that wraps the parallel environment, such as `vslam_env.wrappers.Scaled`; None: it stays as it
+            is.
         **kwargs: Arguments of `vslam_v1.parallel_env` except `num_robots`.
 
     Attributes:
@@ -35,26 +37,33 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
         "render_fps": ExplorationEnv.metadata["render_fps"],
     }
 
-    def __init__(self, render_mode: str | None = None, version: int = 1, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        version: int = 1,
+        wrap: Callable[[Any], Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
         if kwargs.get("num_robots", 1) != 1:
             raise argument_error("num_robots", "1", kwargs["num_robots"], "Use vslam_v1.parallel_env for a team.")
         if version not in VERSIONS:
             raise argument_error("version", "0 or 1", version, "Omit it for the current version.")
         self.parallel = VERSIONS[version](**kwargs | {"num_robots": 1, "render_mode": render_mode})
         self.render_mode = render_mode
-        self.observation_space = self.parallel.observation_space(AGENT)
-        self.action_space = self.parallel.action_space(AGENT)
+        self._wrapped = self.parallel if wrap is None else wrap(self.parallel)
+        self.observation_space = self._wrapped.observation_space(AGENT)
+        self.action_space = self._wrapped.action_space(AGENT)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; see `ExplorationEnv.reset`."""
         seed = None if seed is None else check_int("seed", seed, 0, "Give an int >= 0, or None.")
         super().reset(seed=seed)
-        observations, infos = self.parallel.reset(seed, options)
+        observations, infos = self._wrapped.reset(seed, options)
         return observations[AGENT], infos[AGENT]
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Execute an action; see `ExplorationEnv.step`."""
-        observations, rewards, terminations, truncations, infos = self.parallel.step({AGENT: action})
+        observations, rewards, terminations, truncations, infos = self._wrapped.step({AGENT: action})
         return observations[AGENT], rewards[AGENT], terminations[AGENT], truncations[AGENT], infos[AGENT]
 
     def render(self) -> NDArray[np.uint8] | None:

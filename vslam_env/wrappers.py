@@ -1,32 +1,28 @@
-"""Wrappers that give masks of `goal` actions the form of a learning library."""
+"""Wrappers for learners: observations in the order of one, and masks of `goal` actions in the form of a library."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
-from slam_backend.core.validation import argument_error
-from vslam_env.belief.observation import flatten, observation_space
-from vslam_env.belief.observation_keys import MASK
+from slam_backend.core.validation import Float32Array, argument_error
+from vslam_env.belief.observation import GRIDS, flatten, observation_space
+from vslam_env.belief.observation_keys import MASK, SCALES, key_spaces
 from vslam_env.environment import ExplorationEnv
 
-VECTOR, WHOLE = "observation", "observations"
+VECTOR, WHOLE, IMAGE = "observation", "observations", "image"
+BLOCK = 4  # cells of a grid along a side that become one
 
 
-class _MaskWrapper(BaseParallelWrapper):  # type: ignore[misc]   # its types are not checked
-    """Environment with masks whose observations and infos are changed.
-
-    Raises:
-        ValueError: If the environment has no masks.
-    """
+class _Wrapper(BaseParallelWrapper):  # type: ignore[misc]   # its types are not checked
+    """Environment whose observations and infos are changed."""
 
     def __init__(self, env: ExplorationEnv) -> None:
         super().__init__(env)
         self._config = env.unwrapped.config
-        kind = self._config.action_type
-        if kind != "goal":
-            raise argument_error("action_type", "'goal', whose actions have masks", kind, "Choose goal actions.")
         self.observation_spaces = {agent: self._space(env.observation_space(agent)) for agent in env.possible_agents}
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -50,6 +46,90 @@ class _MaskWrapper(BaseParallelWrapper):  # type: ignore[misc]   # its types are
         raise NotImplementedError
 
 
+class Scaled(_Wrapper):
+    """Observations in the order of one, as learners without a normalisation of their own need them; all float32.
+
+    Metres, radians, seconds and numbers are divided by what is usual (`observation_keys.SCALES`); grids become shares
+    from 0 to 1 in blocks of 4 x 4 cells, so that (3, 48, 48) uint8 become (3, 12, 12). Flat observations stay vectors,
+    of less than a tenth of the length. The mask of `goal` actions, images and `state()` stay as they are.
+
+    Args:
+        env: Environment with dict or flat observations.
+    """
+
+    def __init__(self, env: ExplorationEnv) -> None:
+        config = env.unwrapped.config
+        scan = config.scan
+        boxes = key_spaces(scan.num_rays, scan.max_range)
+        self._shapes = {name: boxes[name].shape for name in config.observed if name != MASK}
+        super().__init__(env)
+
+    def _space(self, space: Any) -> spaces.Space[Any]:
+        if isinstance(space, spaces.Box):
+            return spaces.Box(self._scaled_vector(space.low), self._scaled_vector(space.high), dtype=np.float32)
+        return spaces.Dict({name: self._part_space(name, box) for name, box in space.items()})
+
+    def _part_space(self, name: str, box: Any) -> spaces.Space[Any]:
+        if name == VECTOR:
+            return self._space(box)
+        if name in (MASK, IMAGE):
+            return box  # type: ignore[no-any-return]
+        return spaces.Box(_scaled(name, box.low), _scaled(name, box.high), dtype=np.float32)
+
+    def _changed(self, observations: Any, infos: Any) -> tuple[Any, Any]:
+        return {agent: self._scaled(seen) for agent, seen in observations.items()}, infos
+
+    def _scaled(self, seen: Any) -> Any:
+        """Return a scaled observation in the same form."""
+        if not isinstance(seen, Mapping):
+            return self._scaled_vector(seen)
+        return {
+            name: self._scaled_vector(part)
+            if name == VECTOR
+            else part
+            if name in (MASK, IMAGE)
+            else _scaled(name, part)
+            for name, part in seen.items()
+        }
+
+    def _scaled_vector(self, vector: Float32Array) -> Float32Array:
+        """Return a scaled vector; grids in it are shares already."""
+        parts, begin = [], 0
+        for name, shape in self._shapes.items():
+            end = begin + int(np.prod(shape))
+            part = vector[begin:end].reshape(shape)
+            parts.append((_blocks(part) if name in GRIDS else _scaled(name, part)).ravel())
+            begin = end
+        return np.concatenate(parts)
+
+
+def _scaled(name: str, values: NDArray[Any]) -> Float32Array:
+    """Return the values of a key in the order of one."""
+    scaled = np.asarray(values * np.array(SCALES[name], np.float32), np.float32)
+    return _blocks(scaled) if name in GRIDS else scaled
+
+
+def _blocks(grid: Float32Array) -> Float32Array:
+    """Return the means of blocks of cells, (c, S, S) becomes (c, S / 4, S / 4)."""
+    channels, size, _ = grid.shape
+    blocks = grid.reshape(channels, size // BLOCK, BLOCK, size // BLOCK, BLOCK)
+    return np.asarray(blocks.mean(axis=(2, 4)), np.float32)
+
+
+class _MaskWrapper(_Wrapper):
+    """Environment with masks whose observations and infos are changed.
+
+    Raises:
+        ValueError: If the environment has no masks.
+    """
+
+    def __init__(self, env: ExplorationEnv) -> None:
+        kind = env.unwrapped.config.action_type
+        if kind != "goal":
+            raise argument_error("action_type", "'goal', whose actions have masks", kind, "Choose goal actions.")
+        super().__init__(env)
+
+
 class MasksBesideVectors(_MaskWrapper):
     """Observations `{"observations", "action_mask"}`, both float32 vectors, for RLlib's `ActionMaskingTorchRLModule`.
 
@@ -63,7 +143,7 @@ class MasksBesideVectors(_MaskWrapper):
     """
 
     def _space(self, space: Any) -> spaces.Space[Any]:
-        if "image" in space.spaces:
+        if IMAGE in space.spaces:
             raise argument_error("observe_images", "False: images are no part of a vector", True, "Omit it.")
         scan = self._config.scan
         flat = observation_space(self._config.observed, scan.num_rays, scan.max_range, flat=True)

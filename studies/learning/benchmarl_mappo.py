@@ -24,13 +24,14 @@ from gymnasium import spaces
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, PettingZooWrapper
 
-from agents.goal_network import GRID_SCALE, NAMES
+from agents.goal_network import NAMES
 from agents.trained import MODEL_FILE, save_model
 from training.experiments.run_folder import installed_versions
 from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
 from training.rl.network import GoalPolicy, actor_part
 from vslam_env import NUM_CANDIDATES, vslam_v1
 from vslam_env.belief.observation import observation_space
+from vslam_env.belief.observation_keys import SCALES
 
 CRITIC_CELLS = [128, 128]
 
@@ -81,7 +82,7 @@ class GoalActor(Model):
         for name in NAMES:
             key = (group, name) if name == "action_mask" else (group, "observation", name)
             seen[name] = tensordict.get(key).float()
-        seen["local_grid"] = seen["local_grid"] * GRID_SCALE
+        seen["local_grid"] = seen["local_grid"] * SCALES["local_grid"][0]
         batch = tensordict.get((group, "action_mask")).shape[:-1]
         flat = {name: values.flatten(0, len(batch) - 1) for name, values in seen.items()}
         logits = self.mlp_extractor.forward_actor(self.features_extractor(flat))

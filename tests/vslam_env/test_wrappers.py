@@ -8,7 +8,8 @@ import pytest
 from builders.environments import room
 
 from vslam_env import vslam_v0
-from vslam_env.wrappers import MasksBesideVectors, MasksInInfos
+from vslam_env.belief.observation_keys import KEYS, SCALES, key_spaces
+from vslam_env.wrappers import MasksBesideVectors, MasksInInfos, Scaled
 
 # pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates
 pytestmark = pytest.mark.filterwarnings("ignore:The old environment creation API:DeprecationWarning")
@@ -96,3 +97,61 @@ def test_actions_out_of_bounds_name_the_cure() -> None:
     clipped = gymnasium.wrappers.ClipAction(env)
     clipped.reset(seed=0)
     clipped.step(np.array([1.5, 0.0], np.float32))
+
+
+@pytest.mark.parametrize("action_type", ["continuous", "goal"])
+def test_scaled_observations_are_of_the_order_of_one(action_type: str) -> None:
+    """Scaled observations are float32, small, in their spaces, and hold the same in dicts and vectors."""
+    kinds = {kind: Scaled(_env(kind, action_type=action_type, max_cycles=20)) for kind in ("dict", "flat")}
+    bare = _env("dict", action_type=action_type, max_cycles=20)
+    seen = {kind: env.reset(seed=3)[0] for kind, env in kinds.items()}
+    plain = bare.reset(seed=3)[0]
+    rng = np.random.default_rng(0)
+    while bare.agents:
+        for agent in bare.agents:
+            whole, flat = seen["dict"][agent], seen["flat"][agent]
+            assert kinds["dict"].observation_space(agent).contains(whole)
+            assert kinds["flat"].observation_space(agent).contains(flat)
+            vector = flat["observation"] if action_type == "goal" else flat
+            parts = {name: value for name, value in whole.items() if name != "action_mask"}
+            np.testing.assert_allclose(vector, np.concatenate([value.ravel() for value in parts.values()]), rtol=1e-6)
+            assert vector.dtype == np.float32
+            assert np.abs(vector).max() < 10.0
+            grid = plain[agent]["local_grid"]
+            assert parts["local_grid"].shape == (3, 12, 12)
+            assert parts["local_grid"].mean() == pytest.approx(grid.mean() / 255.0, rel=1e-5)
+        actions = {agent: _valid(bare, agent, plain[agent], rng) for agent in bare.agents}
+        seen = {kind: env.step(actions)[0] for kind, env in kinds.items()}
+        plain = bare.step(actions)[0]
+
+
+def _valid(env: Any, agent: str, seen: Any, rng: np.random.Generator) -> Any:
+    """Return a random action that is valid."""
+    if "action_mask" in seen:
+        return int(rng.choice(np.flatnonzero(seen["action_mask"])))
+    space = env.action_space(agent)
+    return rng.uniform(space.low, space.high).astype(np.float32)
+
+
+def test_scaled_environments_pass_the_checkers() -> None:
+    """PettingZoo's suite and Gymnasium's checker pass; snapshots, `state` and beliefs are those of the environment."""
+    from gymnasium.utils.env_checker import check_env
+    from pettingzoo.test import parallel_api_test
+
+    env = Scaled(_env("flat", action_type="discrete"))
+    parallel_api_test(env, num_cycles=6)
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.state(), env.unwrapped.state())
+    assert env.belief("robot_0").robot == 0
+    solo = gymnasium.make(
+        "vslam_env/SoloExploration-v1", wrap=Scaled, world=room(), num_particles=10, max_cycles=3,
+        disable_env_checker=True,
+    )  # fmt: skip
+    check_env(solo.unwrapped, skip_render_check=True)
+    assert solo.observation_space["local_grid"].shape == (3, 12, 12)
+
+
+@pytest.mark.parametrize("name", [name for name in KEYS if name != "action_mask"])
+def test_every_column_has_a_scale(name: str) -> None:
+    """Each key has one factor for all its columns, or one for each."""
+    assert len(SCALES[name]) in (1, key_spaces(32, 8.0)[name].shape[-1])

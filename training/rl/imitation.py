@@ -21,7 +21,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import configure
 
-from agents.goal_network import GRID_SCALE, NAMES, SHAPES, Weights, logits
+from agents.goal_network import NAMES, SHAPES, Weights, logits
 from agents.planners.next_best_view import decide
 from agents.trained import load_model
 from slam_backend.core.array_files import read_arrays
@@ -33,6 +33,7 @@ from training.rl.network import GoalPolicy, actor_part, check_finite
 from training.vec_env import ExplorationVecEnv, load_kernels
 from vslam_env import vslam_v1
 from vslam_env.belief.observation import observation_space
+from vslam_env.belief.observation_keys import SCALES
 from vslam_env.config import EnvConfig
 
 FORMAT = 3  # incremented when the content of files of labels or the meaning of observations changes
@@ -494,7 +495,7 @@ class Imitation:
         """Return cross entropies (m,), and probabilities (m, 1 + C) of the teacher and of the pupil, for m labels."""
         inputs = data.inputs(rows)
         seen = {name: torch.from_numpy(inputs[name]).to(self._device).float() for name in NAMES}
-        seen["local_grid"] *= GRID_SCALE
+        seen["local_grid"] *= SCALES["local_grid"][0]
         scores = self.policy.logits(seen).log_softmax(1)
         wishes = (torch.from_numpy(data.preferences[rows]).to(self._device) / self.config.temperature).softmax(1)
         return -(wishes * scores).sum(1), wishes, scores.exp()

@@ -15,7 +15,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from agents.goal_network import (
-    CANDIDATE_SCALE,
     CHANNELS,
     FEED_WIDTH,
     INVALID,
@@ -24,7 +23,6 @@ from agents.goal_network import (
     PATCHES,
     PICTURE_SIZE,
     SHAPES,
-    TEAMMATE_SCALE,
     VECTOR_SIZE,
     VECTORS,
     WIDTH,
@@ -32,6 +30,7 @@ from agents.goal_network import (
 )
 from agents.trained import check_observation
 from training.rl.true_state import STATE
+from vslam_env.belief.observation_keys import SCALES
 
 GROUP = 60  # observations that attention pads to the same number of tokens
 NUM_SLOTS, NUM_FEATURES = SHAPES["candidates"]
@@ -98,12 +97,11 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
         )  # fmt: skip
         self.robot = nn.Linear(PICTURE_SIZE + VECTOR_SIZE, WIDTH)
         self.candidate = nn.Linear(NUM_FEATURES, WIDTH)
-        self.teammate = nn.Linear(len(TEAMMATE_SCALE), WIDTH)
+        self.teammate = nn.Linear(len(SCALES["teammates"]), WIDTH)
         self.layers = nn.ModuleList(AttentionLayer() for _ in range(NUM_LAYERS))
         self.last_norm = nn.LayerNorm(WIDTH)
-        scales = {**VECTORS, "candidates": CANDIDATE_SCALE, "teammates": TEAMMATE_SCALE}
-        for name, scale in scales.items():
-            self.register_buffer(f"{name}_scale", torch.tensor(scale), persistent=False)
+        for name in (*VECTORS, "candidates", "teammates"):
+            self.register_buffer(f"{name}_scale", torch.tensor(SCALES[name]), persistent=False)
 
     def forward(self, observations: dict[str, Any]) -> Any:
         """Return (n, (1 + C) x WIDTH + C + S): tokens of robot and candidates (0 if invalid), mask, true state."""

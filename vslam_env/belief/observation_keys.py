@@ -57,6 +57,32 @@ def _box(low: FloatArray, high: FloatArray) -> spaces.Box:
 
 
 KEYS = tuple(key_spaces(2, 1.0))
+COLUMN_SCALES: dict[str, float] = {
+    "x": 0.1,
+    "y": 0.1,
+    "path_length": 0.1,
+    "size": 0.25,
+    "teammate_path_length": 1.0 / 60.0,
+    "unknown_area": 0.05,
+    "unseen_wall": 0.25,
+    "weak_landmarks": 0.25,
+    "uncertain_length": 0.1,
+    "nearest_candidate": 0.1,
+}  # of candidates; 1 for the others
+SCALES: dict[str, tuple[float, ...]] = {
+    "pose": (0.1, 0.1, 1.0),
+    "pose_std": (2.0, 2.0, 10.0),
+    "map_stats": (0.01, 5.0, 5.0, 0.1, 1.0, 0.25),
+    "local_grid": (1.0 / GRID_ON,),
+    "scan": (0.125,),
+    "candidates": tuple(COLUMN_SCALES.get(name, 1.0) for name in CANDIDATE_FEATURES),
+    "teammates": (0.1, 0.1, 1.0, 1.0, 2.0),
+    "teammates_mask": (1.0,),
+    "landmark_counts": (0.02,),
+    "time_left": (0.01,),
+    "global_grid": (1.0 / GRID_ON,),
+    "global_grid_frame": (0.1,),
+}  # factors for the columns of all keys but the mask that scale them to the order of one, as networks take them
 DRIVER = ("pose", "pose_std", "map_stats", "local_grid", "scan", "teammates", "teammates_mask")
 CHOICE = ("candidates", "landmark_counts", "time_left", "global_grid", "global_grid_frame")
 SETS: dict[str, tuple[str, ...]] = {"driver": DRIVER, "goal": DRIVER + CHOICE, "all": KEYS}  # mask: by action type
