@@ -1,4 +1,4 @@
-"""`NextBestView`: planner that explores first, and then looks again at walls and landmarks seen too rarely.
+"""`NextBestView`: planner that explores first, and then looks again at walls seen too rarely.
 
 Ours; nearest to the greedy next-best-view planning of Gonzalez-Banos and Latombe, "Navigation strategies for exploring
 indoor environments", IJRR 2002, and to the active revisits of Stachniss, Haehnel and Burgard, "Exploration with active
@@ -8,8 +8,8 @@ again pays; but maps must meet first, since each robot is scored by the map that
 1. A robot explores while there are frontiers to which no teammate has a shorter path, chosen by distance advantage
    (`agents.planners.distance_advantage`): of the planners here its robots share their maps earliest. Views on the way
    are not taken: each costs a stop, and exploring takes longer by more than they show.
-2. Otherwise it goes to views, worth what they show, walls [m] looked at too little and weak landmarks, for the path to
-   them. Frontiers that are left to teammates come after that.
+2. Otherwise it goes to views, worth what they show, walls [m] looked at too little, for the path to them. Frontiers
+   that are left to teammates come after that. Landmarks measured too rarely are no reason to go: most are false points.
 3. If nothing is left to see and robots are missing in the group, or a loop can be closed, the robot goes to the nearest
    rendezvous.
 
@@ -26,7 +26,6 @@ from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
 
-LANDMARK_VALUE = 0.6  # [m] of unseen wall that a weak landmark is worth
 STOP = 3.0  # [m] path that takes as long as the turn to a view and the look
 PATH_POWER = 0.8  # exponent of the path's length: below 1, far views of much come before near views of little
 HOLD = 1.5  # factor for the value of the current goal
@@ -111,7 +110,7 @@ def view_rates(belief: Belief, held: int | None = None) -> FloatArray:
         held: Slot of its previous goal.
     """
     candidates = belief.candidates
-    values = candidates.gains.unseen_wall + LANDMARK_VALUE * candidates.gains.weak_landmarks
+    values = candidates.gains.unseen_wall.copy()
     if held is not None:
         values[held] *= HOLD
     is_view = candidates.kinds == CandidateKind.REVISIT

@@ -137,8 +137,8 @@ class Candidates:
         lengths: (C,) float64 [m]. Lengths of the paths to the goals at the last update; NaN in empty slots.
         valid: (C,) bool. True where a slot holds a candidate.
         kinds: (C,) int64. `CandidateKind` of each candidate; -1 in empty slots.
-        sizes: (C,) float64 [m]. Length of a frontier; value of what is seen again, walls [m] plus 0.6 m per landmark;
-            0 for rendezvous; NaN in empty slots.
+        sizes: (C,) float64 [m]. Length of a frontier; length of the walls seen again; 0 for
+            rendezvous; NaN in empty slots.
         gains: Gains at each candidate.
         teammate_lengths: (C, T) float64 [m]. Lengths of the paths of the teammates, in the order of
             `Belief.teammates`, over the floor that this robot knows; inf: none known.

@@ -215,7 +215,7 @@ def renew_candidates(
     weak, sure = worth_seeing(cells, looks, part, *landmarks)
 
     revisits = rows[first_revisit:first_rendezvous]
-    targets = collect_targets(cells, part, looks, weak)
+    targets = collect_targets(cells, part, looks)
     values = targets[:, 4].copy()
     for i in range(len(revisits)):
         if not np.isnan(revisits[i, X]) and not distant[first_revisit + i]:

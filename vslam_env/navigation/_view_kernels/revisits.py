@@ -17,14 +17,13 @@ from vslam_env.navigation._view_kernels.looks import (
     mark_borders,
     nearest_look,
 )
-from vslam_env.navigation._view_kernels.view_gains import AT_WALL, is_clear
+from vslam_env.navigation._view_kernels.view_gains import is_clear
 
 BLOCK = 5  # [cells] side of the blocks into which unseen walls are cut
 SPACING = 6  # [cells] between the places that are tried
 BINS = 24  # headings that are tried; a view holds targets of three neighbouring ones
 FARTHEST = 4.5  # [m] from which targets are looked at
 LEAST_BLOCK = 2  # border cells of a block that is a target
-LANDMARK_VALUE = 0.6  # [m] of unseen wall that a weak landmark is worth
 MOST_TARGETS = 192
 LEAST_GAIN, LEAST_KEPT = 1.0, 0.6  # [m] of a new candidate and of one that is kept
 APART = 1.0  # [m] between new candidates
@@ -34,12 +33,11 @@ GIVEN_UP = 2  # [cells] around a target that is given up
 
 @device
 @jit
-def collect_targets(cells: Any, bounds: Any, looks: Any, weak: Any) -> Any:
-    """Return what should be looked at again: blocks of walls looked at too little, and weak landmarks.
+def collect_targets(cells: Any, bounds: Any, looks: Any) -> Any:
+    """Return what should be looked at again: blocks of walls looked at too little.
 
     Returns:
-        (n, 6) float64 rows: x, y [m]; unit normal of the wall, zeros if none; value [m]; length [m] of the end of a
-        line of sight that may lead through the wall.
+        (n, 5) float64 rows: x, y [m]; unit normal of the wall, zeros if none; value [m].
     """
     size = len(cells)
     top, left = max(bounds[0], 1) // BLOCK, max(bounds[1], 1) // BLOCK
@@ -60,7 +58,7 @@ def collect_targets(cells: Any, bounds: Any, looks: Any, weak: Any) -> Any:
                 if cells[row + v, col + u] == OCCUPIED:
                     block[2], block[3] = block[2] - lack * u, block[3] - lack * v
             block[4] += lack
-    targets = np.empty((MOST_TARGETS, 6))
+    targets = np.empty((MOST_TARGETS, 5))
     num = 0
     for r in range(blocks.shape[0]):
         for c in range(blocks.shape[1]):
@@ -71,14 +69,8 @@ def collect_targets(cells: Any, bounds: Any, looks: Any, weak: Any) -> Any:
                 targets[num, 0], targets[num, 1] = block[0] / block[4], block[1] / block[4]
                 targets[num, 2] = block[2] / length if is_flat else 0.0
                 targets[num, 3] = block[3] / length if is_flat else 0.0
-                targets[num, 4], targets[num, 5] = CELL * block[4], 0.0
+                targets[num, 4] = CELL * block[4]
                 num += 1
-    for k in range(len(weak)):
-        if num < MOST_TARGETS:
-            targets[num, 0], targets[num, 1] = weak[k, 0], weak[k, 1]
-            targets[num, 2] = targets[num, 3] = 0.0
-            targets[num, 4], targets[num, 5] = LANDMARK_VALUE, AT_WALL
-            num += 1
     return targets[:num]
 
 
@@ -94,7 +86,7 @@ def is_measurable(cells: Any, target: Any, x: float, y: float, reach: float) -> 
         before = -(u * target[2] + v * target[3])
         if before < 0.0 or before * before < FACING * FACING * square:
             return False
-    return is_clear(cells, x, y, target[0], target[1], target[5])
+    return is_clear(cells, x, y, target[0], target[1], 0.0)
 
 
 @inline
@@ -149,7 +141,7 @@ def keep_revisits(
 ) -> None:  # fmt: skip
     """Keep the revisit candidates (m, 5) with something left to gain, and empty the other slots.
 
-    Looks (S, S) and their bounds (4,) are given together. Values (n,) of targets (n, 6)
+    Looks (S, S) and their bounds (4,) are given together. Values (n,) of targets (n, 5)
     that candidates cover become 0. Distant candidates, a mask (m,), stay as they are.
     """
     looks, looks_bounds = seen
