@@ -252,6 +252,7 @@ class Curves:
         words: Headings of fields, and texts of their values.
         label: Label of a logarithmic axis that all curves share, in a panel for each combination; empty: each curve has
             its own panels.
+        axis: Label of the x axis.
     """
 
     by: tuple[str, ...]
@@ -259,6 +260,7 @@ class Curves:
     rows: tuple[str, ...] = ()
     words: Words = field(default_factory=dict)
     label: str = ""
+    axis: str = "time [s]"
 
     def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
         """Return a line for each group and time: the fields, `time_s`, and means with the ends of their intervals.

@@ -130,7 +130,7 @@ def draw_curves(file: Path, curves: Curves, rows: Sequence[Row]) -> None:
                 ax.grid(alpha=0.2)
             panels[0].set_title(_label(curves, curves.rows, place), loc="left")
         for ax in axes[-1]:
-            ax.set_xlabel("time [s]")
+            ax.set_xlabel(curves.axis)
         add_legend(figure, axes[0][0], title=", ".join(in_words(name)[0] for name in names))
         save_png(figure, file, 110)
 
@@ -153,7 +153,7 @@ def _draw_shared(file: Path, curves: Curves, lines: Sequence[Row]) -> None:
             if place % columns == 0:
                 ax.set_ylabel(curves.label)
             if place + columns >= len(panels):
-                ax.set_xlabel("time [s]")
+                ax.set_xlabel(curves.axis)
                 ax.tick_params(labelbottom=True)
         for ax in axes[len(panels) :]:
             ax.set_visible(False)
