@@ -112,6 +112,11 @@ def mean_return(robots: int, episodes: int, make: Callable[[], Policy]) -> float
     return float(np.mean(returns))
 
 
+NAMES = {PPO: "PPO", "random_goals": "random valid goals", "frontier": "nearest frontier"}
+WORDS = {
+    "robots": ("robots", lambda robots: "one robot" if robots == 1 else f"{robots} robots"),
+    "policy": ("policy", NAMES.__getitem__),
+}
 COLUMNS = (
     Column("sampled", "actions sampled [m]", interval=True),
     Column("greedy", "most probable action [m]", interval=True),
@@ -122,12 +127,12 @@ STUDY = Study(
     tables=(
         ResultTable(
             name="returns", title="Return in validation worlds, mean over the trainings", by=("robots", "policy"),
-            columns=COLUMNS,
+            columns=COLUMNS, words=WORDS,
         ),
     ),
     curves=Curves(
         by=("robots", "policy"), columns=(Column("return_m", "return [m]", interval=True),), rows=("robots",),
-        axis="decisions of a robot",
+        axis="decisions of a robot", words=WORDS,
     ),
 )  # fmt: skip
 
