@@ -348,10 +348,14 @@ def _saved(file: Path) -> Path:
 
 
 def test_the_shipped_model_is_small_and_has_a_card() -> None:
-    """`learned` plays the model in `agents/pretrained/`, of less than 1 MB, greedily; its card names these weights."""
+    """`learned` plays the model in `agents/pretrained/`, of less than 1 MB, greedily; its card names these weights.
+
+    `vslam evaluate` plays its environment, which is one of this version.
+    """
     assert LEARNED.stat().st_size < 1_000_000
     weights, about = load_model(LEARNED)
     assert about["weights"] in LEARNED.with_suffix(".md").read_text(encoding="utf-8")
+    assert EnvConfig.from_toml_text(about["environment"]).action_type == "goal"
     env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, action_type="goal", max_seconds=5.0)
     seen, _ = env.reset(seed=2)
     for agent in env.agents:
