@@ -57,12 +57,13 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     """Train a model, or take a scripted policy, and play it in validation worlds.
 
     Returns:
-        `curves`: mean return in the training [m] by decisions of a robot, a level line for scripted policies; `sampled`
-        and `greedy`: mean return in validation worlds [m] of sampled actions and of the most probable ones.
+        `curves`: mean return in the training [m] by thousands of decisions of a robot, a level line for scripted
+        policies; `sampled` and `greedy`: mean return in validation worlds [m] of sampled actions and of the most
+        probable ones.
     """
     if trial.policy != PPO:
         level = mean_return(trial.robots, config.episodes, partial(_scripted, trial.policy))
-        curve = {"time_s": [0.0, float(config.decisions)], "return_m": [level, level]}
+        curve = {"time_s": [0.0, config.decisions / 1000], "return_m": [level, level]}
         return {"curves": curve, "sampled": level, "greedy": level}
     model, points = train(trial.robots, config.decisions * trial.robots, trial.seed)
     parts = np.array_split(np.array(points), min(POINTS, len(points)))
@@ -70,7 +71,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
         mean_return(trial.robots, config.episodes, partial(_Model, model, is_greedy)) for is_greedy in (False, True)
     )
     curve = {
-        "time_s": [float(part[-1, 0]) / trial.robots for part in parts],
+        "time_s": [float(part[-1, 0]) / trial.robots / 1000 for part in parts],
         "return_m": [float(part[:, 1].mean()) for part in parts],
     }
     return {"curves": curve, "sampled": sampled, "greedy": greedy}
@@ -132,7 +133,7 @@ STUDY = Study(
     ),
     curves=Curves(
         by=("robots", "policy"), columns=(Column("return_m", "return [m]", interval=True),), rows=("robots",),
-        axis="decisions of a robot", words=WORDS,
+        axis="thousands of decisions of a robot", words=WORDS,
     ),
 )  # fmt: skip
 
