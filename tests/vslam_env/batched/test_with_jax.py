@@ -11,6 +11,7 @@ import pytest
 HERE = Path(__file__).parent
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("jax") is None, reason="jax, an optional extra, is not installed")
 def test_the_tests_with_jax_pass_in_a_process_of_their_own() -> None:
     """All tests of the folder run there, and none is skipped."""
