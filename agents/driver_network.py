@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from agents.goal_network import CHANNELS, PATCHES, scaled
+from agents.goal_network import CHANNELS, PATCHES
 from agents.goal_network import SHAPES as GOAL_SHAPES
+from vslam_env.belief.observation_keys import in_order_of_one
 
 NAMES = ("local_grid", "pose_std", "map_stats", "scan", "teammates", "teammates_mask")
 SHAPES: dict[str, tuple[int, ...]] = {name: GOAL_SHAPES[name] for name in NAMES}
@@ -41,7 +42,7 @@ def outputs(weights: Mapping[str, Any], observations: Mapping[str, Any], xp: Any
         observations: Arrays (n, ...) by name, as robots observe them.
         xp: Module of the arrays, `numpy` or `jax.numpy`.
     """
-    picture = scaled(observations, "local_grid", xp)
+    picture = in_order_of_one("local_grid", observations["local_grid"], xp)
     count, depth, size, _ = picture.shape
     picture = xp.moveaxis(picture, 1, -1)
     for i, side in enumerate(PATCHES):
@@ -50,7 +51,7 @@ def outputs(weights: Mapping[str, Any], observations: Mapping[str, Any], xp: Any
         patches = xp.moveaxis(patches, 2, 3).reshape(count, size, size, side * side * depth)
         picture = xp.maximum(patches @ weights[f"picture.{i}.weight"] + weights[f"picture.{i}.bias"], 0.0)
         depth = CHANNELS[i]
-    vectors = [scaled(observations, name, xp).reshape(count, -1) for name in NAMES[1:]]
+    vectors = [in_order_of_one(name, observations[name], xp).reshape(count, -1) for name in NAMES[1:]]
     hidden = xp.concatenate([picture.reshape(count, -1), *vectors], axis=1)
     last = len(HIDDEN)
     for i in range(last):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import BoolArray, Float32Array, IntArray
-from vslam_env.belief.observation_keys import SCALES
+from vslam_env.belief.observation_keys import in_order_of_one
 from vslam_env.navigation import CANDIDATE_FEATURES, NUM_CANDIDATES
 
 Weights = Mapping[str, Float32Array]
@@ -42,11 +42,6 @@ EPSILON = 1e-5  # added to variances by the normalisation
 INVALID = -1e8  # logit of an invalid action
 VECTOR_SIZE = sum(int(np.prod(SHAPES[name])) for name in VECTORS)
 PICTURE_SIZE = CHANNELS[1] * (48 // (PATCHES[0] * PATCHES[1])) ** 2
-
-
-def scaled(observations: Mapping[str, Any], name: str, xp: Any = np) -> Any:
-    """Return an array of observations in the order of one, float32, in numpy or in jax (`xp`)."""
-    return observations[name] * xp.asarray(SCALES[name], dtype=xp.float32)
 
 
 def weight_shapes() -> dict[str, tuple[int, ...]]:
@@ -82,16 +77,16 @@ def logits(weights: Weights, observations: Mapping[str, NDArray[Any]]) -> Float3
         weights: Weights by the layer names of the learner.
         observations: (n, ...) arrays by name, as the environment returns them.
     """
-    picture = scaled(observations, "local_grid")
+    picture = in_order_of_one("local_grid", observations["local_grid"])
     n = len(picture)
     for layer, patch in enumerate(PATCHES):
         picture = np.maximum(_convolve(picture, weights, f"picture.{2 * layer}", patch), 0.0)
-    vectors = [scaled(observations, name).reshape(n, -1) for name in VECTORS]
+    vectors = [in_order_of_one(name, observations[name]).reshape(n, -1) for name in VECTORS]
     robot = _linear(weights, "robot", np.concatenate([picture.reshape(n, -1), *vectors], axis=1))
     is_valid, is_mate = observations["action_mask"][:, 1:] != 0, observations["teammates_mask"] != 0
     present = np.concatenate([np.ones((n, 1), np.bool_), is_valid, is_mate], axis=1)
-    slots = _linear(weights, "candidate", scaled(observations, "candidates"))
-    mates = _linear(weights, "teammate", scaled(observations, "teammates"))
+    slots = _linear(weights, "candidate", in_order_of_one("candidates", observations["candidates"]))
+    mates = _linear(weights, "teammate", in_order_of_one("teammates", observations["teammates"]))
     tokens = np.concatenate([robot[:, None], slots, mates], axis=1)[present]
     row, place = np.nonzero(present)[0], (present.cumsum(axis=1) - 1)[present]
     size = int(present.sum(axis=1).max())
@@ -136,8 +131,8 @@ def _attention(
 def _normalised(weights: Weights, name: str, tokens: NDArray[Any]) -> NDArray[Any]:
     """Scale tokens to mean 0 and variance 1, and then by the weights."""
     centred = tokens - tokens.mean(axis=-1, keepdims=True)
-    divided = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(EPSILON))
-    normalised: NDArray[Any] = divided * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+    scaled = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(EPSILON))
+    normalised: NDArray[Any] = scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
     return normalised
 
 

@@ -10,7 +10,7 @@ from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 from slam_backend.core.validation import Float32Array, argument_error
 from vslam_env.belief.observation import GRIDS, flatten, observation_space
-from vslam_env.belief.observation_keys import MASK, SCALES, key_spaces
+from vslam_env.belief.observation_keys import MASK, in_order_of_one, key_spaces
 from vslam_env.environment import ExplorationEnv
 
 VECTOR, WHOLE, IMAGE = "observation", "observations", "image"
@@ -49,9 +49,9 @@ class _Wrapper(BaseParallelWrapper):  # type: ignore[misc]   # its types are not
 class Scaled(_Wrapper):
     """Observations in the order of one, as learners without a normalisation of their own need them; all float32.
 
-    Metres, radians, seconds and numbers are divided by what is usual (`observation_keys.SCALES`); grids become shares
-    from 0 to 1 in blocks of 4 x 4 cells, so that (3, 48, 48) uint8 become (3, 12, 12). Flat observations stay vectors,
-    of less than a tenth of the length. The mask of `goal` actions, images and `state()` stay as they are.
+    Metres, radians, seconds and numbers are multiplied by `observation_keys.SCALES`; grids become shares from 0 to 1
+    in blocks of 4 x 4 cells, so that (3, 48, 48) uint8 become (3, 12, 12). Flat observations stay vectors, of less
+    than a tenth of the length. The mask of `goal` actions, images and `state()` stay as they are.
 
     Args:
         env: Environment with dict or flat observations.
@@ -66,47 +66,36 @@ class Scaled(_Wrapper):
 
     def _space(self, space: Any) -> spaces.Space[Any]:
         if isinstance(space, spaces.Box):
-            return spaces.Box(self._scaled_vector(space.low), self._scaled_vector(space.high), dtype=np.float32)
+            return self._part_space(VECTOR, space)
         return spaces.Dict({name: self._part_space(name, box) for name, box in space.items()})
 
     def _part_space(self, name: str, box: Any) -> spaces.Space[Any]:
-        if name == VECTOR:
-            return self._space(box)
-        if name in (MASK, IMAGE):
-            return box  # type: ignore[no-any-return]
-        return spaces.Box(_scaled(name, box.low), _scaled(name, box.high), dtype=np.float32)
+        low, high = self._part(name, box.low), self._part(name, box.high)
+        return spaces.Box(low, high, dtype=low.dtype)
 
     def _changed(self, observations: Any, infos: Any) -> tuple[Any, Any]:
-        return {agent: self._scaled(seen) for agent, seen in observations.items()}, infos
-
-    def _scaled(self, seen: Any) -> Any:
-        """Return a scaled observation in the same form."""
-        if not isinstance(seen, Mapping):
-            return self._scaled_vector(seen)
-        return {
-            name: self._scaled_vector(part)
-            if name == VECTOR
-            else part
-            if name in (MASK, IMAGE)
-            else _scaled(name, part)
-            for name, part in seen.items()
+        changed = {
+            agent: {name: self._part(name, values) for name, values in seen.items()}
+            if isinstance(seen, Mapping)
+            else self._part(VECTOR, seen)
+            for agent, seen in observations.items()
         }
+        return changed, infos
 
-    def _scaled_vector(self, vector: Float32Array) -> Float32Array:
-        """Return a scaled vector; grids in it are shares already."""
+    def _part(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
+        """Return one array of an observation in the order of one; grids in a vector are shares already."""
+        if name in (MASK, IMAGE):
+            return values
+        if name != VECTOR:
+            scaled: NDArray[Any] = in_order_of_one(name, values)
+            return _blocks(scaled) if name in GRIDS else scaled
         parts, begin = [], 0
-        for name, shape in self._shapes.items():
+        for key, shape in self._shapes.items():
             end = begin + int(np.prod(shape))
-            part = vector[begin:end].reshape(shape)
-            parts.append((_blocks(part) if name in GRIDS else _scaled(name, part)).ravel())
+            part = values[begin:end].reshape(shape)
+            parts.append((_blocks(part) if key in GRIDS else in_order_of_one(key, part)).ravel())
             begin = end
         return np.concatenate(parts)
-
-
-def _scaled(name: str, values: NDArray[Any]) -> Float32Array:
-    """Return the values of a key in the order of one."""
-    scaled = np.asarray(values * np.array(SCALES[name], np.float32), np.float32)
-    return _blocks(scaled) if name in GRIDS else scaled
 
 
 def _blocks(grid: Float32Array) -> Float32Array:

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -83,6 +84,13 @@ SCALES: dict[str, tuple[float, ...]] = {
     "global_grid": (1.0 / GRID_ON,),
     "global_grid_frame": (0.1,),
 }  # factors for the columns of all keys but the mask that scale them to the order of one, as networks take them
+
+
+def in_order_of_one(name: str, values: Any, xp: Any = np) -> Any:
+    """Return values (..., columns) of a key in the order of one, float32, in numpy or in jax (`xp`)."""
+    return values * xp.asarray(SCALES[name], dtype=xp.float32)
+
+
 DRIVER = ("pose", "pose_std", "map_stats", "local_grid", "scan", "teammates", "teammates_mask")
 CHOICE = ("candidates", "landmark_counts", "time_left", "global_grid", "global_grid_frame")
 SETS: dict[str, tuple[str, ...]] = {"driver": DRIVER, "goal": DRIVER + CHOICE, "all": KEYS}  # mask: by action type

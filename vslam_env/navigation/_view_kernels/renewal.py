@@ -21,7 +21,7 @@ from vslam_env.navigation._view_kernels.looks import MOST_LOOKS, is_border, lack
 from vslam_env.navigation._view_kernels.revisits import APART, AT_GOAL, add_revisits, collect_targets, keep_revisits
 from vslam_env.navigation._view_kernels.view_gains import UNCERTAIN_LENGTH, view_gains
 
-WEAK = 3  # landmarks with fewer measurements are to be seen again
+WEAK = 3  # landmarks with fewer measurements are weak
 WALL_CELLS = 3  # [cells] from a wall within which a point may be a landmark
 SURE_BLOCK = 10  # [cells] side of blocks of floor; near landmarks in or beside a block a robot can find its pose
 RECHECKED = 4  # updates between computations of the gains of a candidate that stays
