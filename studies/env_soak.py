@@ -85,7 +85,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
 
 def random_config(rng: np.random.Generator) -> EnvConfig:
     """Sample a configuration; few particles, for many steps."""
-    robots = int(rng.integers(1, 6))
+    robots, loss = int(rng.integers(1, 6)), 0.0 if rng.random() < 0.5 else float(rng.uniform(0.1, 0.8))
     action_type = str(rng.choice(["continuous", "discrete", "goal"]))
     return preset_config(str(rng.choice(["easy", "standard", "hard"]))).replace(
         world=str(rng.choice(sorted(WORLD_FAMILIES))),
@@ -103,7 +103,8 @@ def random_config(rng: np.random.Generator) -> EnvConfig:
         oracle_merge=bool(rng.random() < 0.2),
         comm_range=None if rng.random() < 0.5 else float(rng.uniform(3.0, 12.0)),
         comm_line_of_sight=bool(rng.random() < 0.2),
-        comm_loss=0.0 if rng.random() < 0.5 else float(rng.uniform(0.0, 0.8)),
+        comm_loss=loss,
+        comm_outage_seconds=0.0 if loss == 0.0 or rng.random() < 0.5 else float(rng.uniform(1.0, 30.0)),
         reward={"map_error": 1.0, "coverage": 0.1, "recall": 0.1, "collisions": 0.01, "pose_uncertainty": 0.1},
         belief={"filter": {"num_particles": int(rng.integers(3, 40))}},
     )

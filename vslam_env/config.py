@@ -20,6 +20,7 @@ from slam_backend.team.options import MergeOptions
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.belief.observation_keys import checked_keys
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
+from vslam_env.simulation.communication import outage_rates
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
 from vslam_env.world.spec import LARGEST_EXTENT
 
@@ -183,7 +184,9 @@ class EnvConfig:
             these.
         comm_range: Largest distance of two robots in contact [m]; None: unlimited.
         comm_line_of_sight: Whether walls block contacts.
-        comm_loss: Probability that a contact fails, drawn for each pair and tick.
+        comm_loss: Share of the time in which a contact fails, for each pair of robots.
+        comm_outage_seconds: Mean duration for which a contact fails [s], from an exponential distribution in whole
+            ticks; 0: drawn in each tick by itself.
         robot_radius: Radius of the robots [m].
         min_start_distance: Least distance between any two start positions [m].
         shared_start_view: Whether two robots may see a common landmark at their starts.
@@ -218,6 +221,7 @@ class EnvConfig:
     comm_range: float | None = None
     comm_line_of_sight: bool = False
     comm_loss: float = 0.0
+    comm_outage_seconds: float = 0.0
     robot_radius: float = 0.2
     min_start_distance: float = 5.0
     shared_start_view: bool = False
@@ -263,6 +267,7 @@ class EnvConfig:
         if self.comm_range is not None:
             check_float("comm_range", self.comm_range, "Give metres, or None for any distance.", at_least=0.0)
         check_float("comm_loss", self.comm_loss, "Give a probability.", at_least=0.0, at_most=1.0)
+        self._check_outages()
         check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0, at_most=LARGEST_EXTENT)
         check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
         check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", at_least=1e-6, at_most=1e6)
@@ -281,6 +286,17 @@ class EnvConfig:
             expected = f"noise that allows the use of points {sensor.farthest:g} m away"
             hint = "Raise sigma_px or baseline, lower sigma_disparity_px, or the max_range of the true camera."
             raise argument_error("belief.filter.camera", expected, f"a limit of {usable:g} m", hint)
+
+    def _check_outages(self) -> None:
+        """Raise unless outages can last as long as said and make up the share of the time that is said."""
+        name, loss, outage = "comm_outage_seconds", self.comm_loss, self.comm_outage_seconds
+        check_float(name, outage, "Give seconds, or 0.", at_least=0.0, at_most=MAX_TICKS * TICK)
+        if outage > 0.0 and not 0.0 < loss < 1.0:
+            hint = "Give the share of the time in which contacts fail, above 0 and below 1."
+            raise argument_error(name, f"0 with a comm_loss of {loss:g}", outage, hint)
+        if outage > 0.0 and outage_rates(loss, outage / TICK)[0] > 1.0:
+            hint = f"Outages that make up {loss:g} of the time last longer in the mean; give more seconds, or 0."
+            raise argument_error(name, f"more seconds with a comm_loss of {loss:g}", outage, hint)
 
     @property
     def observed(self) -> tuple[str, ...]:

@@ -36,6 +36,7 @@ from vslam_env.world import World, WorldSource, check_source, is_single_layout
 
 AgentID = str
 STATE_PER_ROBOT = 12
+STATE_POSITIONS = 0, 4  # first columns of the true and the estimated position in a robot's part of `state()`
 RESET_OPTIONS = ("world_seed", "start_poses")
 PROBE = "options"  # option with which the test suite of PettingZoo resets any environment
 RENDER_MODES = ("human", "rgb_array")

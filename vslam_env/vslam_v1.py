@@ -47,6 +47,7 @@ def parallel_env(
     world_split: str | None = None,
     shared_reward: bool | None = None,
     observation_keys: str | Collection[str] | None = None,
+    comm_outage_seconds: float | None = None,
 ) -> ExplorationEnv:
     """Make the parallel environment, see `ExplorationEnv` for the task.
 
@@ -74,7 +75,7 @@ def parallel_env(
         oracle_merge: Whether groups in contact that share three true landmarks merge with the true transform.
         comm_range: Largest distance of two robots in contact [m]; default unlimited.
         comm_line_of_sight: Whether walls block contacts; default no.
-        comm_loss: Probability that a contact fails in a tick; default 0.
+        comm_loss: Share of the time in which a contact fails; default 0.
         stop_at_recall: Map recall of all robots at which the episode terminates; default never.
         render_mode: `"human"`, `"rgb_array"` or None.
         config: `EnvConfig` or path of its TOML file, instead of a preset.
@@ -83,6 +84,7 @@ def parallel_env(
         shared_reward: Whether each robot gets the mean of all robots' rewards; default no.
         observation_keys: `"driver"`, `"goal"` or `"all"`, sets of keys, or keys in any order; default: those of
             `config`, without one `"goal"` with `goal` actions, else `"driver"`.
+        comm_outage_seconds: Mean duration for which a contact fails [s]; default 0, drawn in each tick by itself.
 
     Raises:
         ValueError: If an argument is invalid; the message names it.
@@ -116,6 +118,7 @@ def parallel_env(
         "comm_range": comm_range,
         "comm_line_of_sight": comm_line_of_sight,
         "comm_loss": comm_loss,
+        "comm_outage_seconds": comm_outage_seconds,
         "stop_at_recall": stop_at_recall,
         "belief": None if num_particles is None else {"filter": {"num_particles": num_particles}},
     }

@@ -54,7 +54,8 @@ OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
     EnvConfig: ("", {
         "num_robots": "1..8", "decision_ticks": COUNT, "max_cycles": [0, True, "9", 2.0], "max_seconds": "(0, 1e8]",
         "stop_at_recall": "(0, 1]",
-        "comm_range": FROM_ZERO, "comm_loss": SHARE, "robot_radius": "(0, 200]", "min_start_distance": FROM_ZERO,
+        "comm_range": FROM_ZERO, "comm_loss": SHARE, "comm_outage_seconds": [-1.0, 5.0, NAN],
+        "robot_radius": "(0, 200]", "min_start_distance": FROM_ZERO,
         "map_error_cutoff": "[1e-6, 1e6]", "comm_line_of_sight": [1], "oracle_pose": ["yes", 1], "oracle_merge": [1],
         "shared_start_view": [0.0], "shared_reward": ["yes"], "sensor": ["sonar"], "action_type": ["jump"],
         "observation_type": ["image"], "belief": [5], "stereo": [StereoCamera()], "world": [3], "reward": [1.0],

@@ -1,17 +1,58 @@
-"""Communication between robots: contacts limited by range, line of sight and random loss."""
+"""Communication between robots: contacts limited by range, line of sight and random failures."""
+
+import math
 
 import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray
 
 
+def outage_rates(loss: float, outage_ticks: float) -> tuple[float, float]:
+    """Return the probabilities that an outage begins and ends in a tick.
+
+    Durations are those of an exponential distribution, in whole ticks, and the share of time in outages is `loss`.
+
+    Args:
+        loss: Share of the time in which a link fails, in (0, 1).
+        outage_ticks: Mean duration of an outage [ticks].
+
+    >>> begin, end = outage_rates(0.5, 100.0)
+    >>> round(begin, 4) == round(end, 4) == 0.01
+    True
+    """
+    end = -math.expm1(-1.0 / outage_ticks)
+    return end * loss / (1.0 - loss), end
+
+
+def next_failures(
+    failing: BoolArray | None, count: int, loss: float, outage_ticks: float, rng: np.random.Generator
+) -> BoolArray:
+    """Draw which links between robots fail in a tick.
+
+    Args:
+        failing: (K, K) bool. Links that failed in the tick before, of which those above the diagonal count; None at
+            first.
+        count: Number of robots K.
+        loss: Share of the time in which a link fails, independently of the others.
+        outage_ticks: Mean duration of an outage [ticks]; 0: each tick is drawn by itself.
+        rng: Source of the draws, equally many in each tick.
+
+    Returns:
+        (K, K) bool, symmetric.
+    """
+    one, other = np.triu_indices(count, 1)
+    draws = rng.random(len(one))
+    fails = draws < loss
+    if failing is not None and outage_ticks > 0.0:
+        begin, end = outage_rates(loss, outage_ticks)
+        fails = np.where(failing[one, other], draws >= end, draws < begin)
+    matrix = np.zeros((count, count), np.bool_)
+    matrix[one, other] = matrix[other, one] = fails
+    return matrix
+
+
 def contacts(
-    poses: FloatArray,
-    walls: FloatArray,
-    comm_range: float | None,
-    line_of_sight: bool,
-    loss: float,
-    rng: np.random.Generator,
+    poses: FloatArray, walls: FloatArray, comm_range: float | None, line_of_sight: bool, failing: BoolArray | None
 ) -> BoolArray:
     """Return the contacts of a tick.
 
@@ -20,8 +61,7 @@ def contacts(
         walls: (S, 4) float64 [m], world frame, rows (x1, y1, x2, y2).
         comm_range: Largest length of a link [m]; None: unlimited.
         line_of_sight: Whether walls block links. Robots never do.
-        loss: Probability that an available link fails in this tick, independently of the others.
-        rng: Source of the draws; unused if `loss` is 0, else drawn from equally often for all poses.
+        failing: (K, K) bool. Links that fail in this tick, see `next_failures`; None: none.
 
     Returns:
         (K, K) bool. Symmetric matrix of contacts; each robot is in contact with itself.
@@ -33,8 +73,8 @@ def contacts(
         linked &= np.hypot(*(poses[one, :2] - poses[other, :2]).T) <= comm_range
     if line_of_sight and linked.any():
         linked[linked] = ~crosses_wall(poses[one[linked], :2], poses[other[linked], :2], walls)
-    if loss > 0.0:
-        linked &= rng.random(len(one)) >= loss
+    if failing is not None:
+        linked &= ~failing[one, other]
     matrix = np.eye(count, dtype=np.bool_)
     matrix[one, other] = matrix[other, one] = linked
     return matrix

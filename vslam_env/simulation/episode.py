@@ -39,7 +39,7 @@ from vslam_env.evaluation.recall_credits import RecallCredits
 from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.reward import OWN_RECALL, RUNNING_COST
 from vslam_env.sensors import RenderedFrame, SensorFrame, TeamRenderedFrames, TeamSensorFrames
-from vslam_env.simulation.communication import contacts
+from vslam_env.simulation.communication import contacts, next_failures
 from vslam_env.simulation.scenario import STREAMS, Scenario, ScenarioPart
 from vslam_env.world import Simulator, read_odometry
 
@@ -116,6 +116,7 @@ class Episode:
         metric_rows=Array(FLOAT64, f"{len(RobotMetrics._fields)} K", nan=True),
         odometry=Maybe(Array(FLOAT64, "K 3", renewed=True)),
         in_contact=Maybe(Array(BOOL, "K K", renewed=True)),
+        failing=Maybe(Array(BOOL, "K K", renewed=True)),
         last_frames=OneOf(TeamSensorFrames, TeamRenderedFrames),
         paths=Array(FLOAT64, "TICKS 2 K 3", renewed=True),
         merge_ticks=Each(Row(Int(), Each(Int(high="K")), Each(Int(high="K"))), kind=list),
@@ -161,6 +162,7 @@ class Episode:
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self._odometry: FloatArray | None = None
         self._in_contact: BoolArray | None = None
+        self._failing: BoolArray | None = None  # links between robots
         self.readings: TeamReadings  # set by `begin`
         self.last_frames: TeamSensorFrames | TeamRenderedFrames  # set by `begin`
 
@@ -323,8 +325,11 @@ class Episode:
     def _contacts(self, poses: FloatArray) -> BoolArray:
         """Return the matrix of contacts (K, K)."""
         config = self._config
-        limits = config.comm_range, config.comm_line_of_sight, config.comm_loss
-        return contacts(poses, self.world.walls, *limits, self._streams["radio"])
+        if config.comm_loss > 0.0:
+            self._failing = next_failures(
+                self._failing, len(poses), config.comm_loss, config.comm_outage_seconds / TICK, self._streams["radio"]
+            )
+        return contacts(poses, self.world.walls, config.comm_range, config.comm_line_of_sight, self._failing)
 
     def _merge_by_oracle(self, networks: IntArray) -> None:
         """Merge all groups in contact that share true landmarks; robots with equal `networks` (K,) are in contact."""

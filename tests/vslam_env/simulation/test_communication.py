@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from slam_backend.geometry import between
 from slam_backend.maps.alignment import Alignment
 from slam_backend.team.reports import MergeEvent
-from vslam_env import ExplorationEnv
+from vslam_env import EnvConfig, ExplorationEnv
 from vslam_env.belief.observation import observe
 from vslam_env.belief.team_belief import TeamBelief
-from vslam_env.simulation.communication import contacts, crosses_wall
+from vslam_env.simulation.communication import contacts, crosses_wall, next_failures, outage_rates
 
 POSES = np.array([[1.0, 1.0, 0.3], [4.0, 5.0, 2.0], [1.0, 9.0, -1.0]])  # the wall at y = 7 cuts the third off
 
@@ -29,7 +29,8 @@ def matrix(*pairs: tuple[int, int]) -> Any:
 
 def hears(comm_range: float | None = None, sight: bool = False, loss: float = 0.0, seed: int = 0) -> Any:
     """Return who hears whom in the room of `small_env`."""
-    return contacts(POSES, WALLS, comm_range, sight, loss, np.random.default_rng(seed))
+    failing = next_failures(None, len(POSES), loss, 0.0, np.random.default_rng(seed))
+    return contacts(POSES, WALLS, comm_range, sight, failing)
 
 
 def test_range_sight_and_loss_cut_links() -> None:
@@ -44,16 +45,71 @@ def test_range_sight_and_loss_cut_links() -> None:
 def test_links_fail_as_often_as_said() -> None:
     """Of 3000 links at a loss of 0.3, 900 fail but for five standard deviations (25 each), both ways at once."""
     rng = np.random.default_rng(1)
-    matrices = np.array([contacts(POSES, WALLS, None, False, 0.3, rng) for _ in range(1000)])
+    matrices = np.array(
+        [contacts(POSES, WALLS, None, False, next_failures(None, 3, 0.3, 0.0, rng)) for _ in range(1000)]
+    )
     np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
     assert abs(np.count_nonzero(~matrices) / 2 - 900) < 5 * 25.1
+
+
+@pytest.mark.parametrize(("loss", "ticks"), [(0.3, 5.0), (0.5, 20.0), (0.8, 20.0)])
+def test_outages_last_and_recur_as_said(loss: float, ticks: float) -> None:
+    """Mean duration and share of the time of outages of 28 links are as asked, but for five standard errors.
+
+    A duration in whole ticks has the mean 1 / (1 - exp(-1 / ticks)).
+    """
+    rng, failing, links = np.random.default_rng(4), None, []
+    for _ in range(20_000):
+        failing = next_failures(failing, 8, loss, ticks, rng)
+        links.append(failing[np.triu_indices(8, 1)])
+    fails = np.array(links)
+    ends = np.count_nonzero(fails[:-1] & ~fails[1:])
+    mean = 1.0 / -np.expm1(-1.0 / ticks)
+    assert fails[:-1].sum() / ends == pytest.approx(mean, abs=5.0 * mean / np.sqrt(ends))
+    assert fails.mean() == pytest.approx(loss, abs=5.0 * np.sqrt(2.0 * mean * loss * (1.0 - loss) / fails.size))
+    begin, end = outage_rates(loss, ticks)
+    assert begin / (begin + end) == pytest.approx(loss)  # of a chain with these probabilities
+
+
+def test_links_without_outages_are_drawn_by_tick() -> None:
+    """With a duration of zero the last tick does not matter, and each tick draws as much as with one."""
+    streams = [np.random.default_rng(1) for _ in range(3)]
+    before = np.ones((5, 5), np.bool_)
+    first, other = (
+        next_failures(failing, 5, 0.4, 0.0, rng) for failing, rng in zip((None, before), streams[:2], strict=True)
+    )
+    np.testing.assert_array_equal(first, other)
+    next_failures(before, 5, 0.4, 30.0, streams[2])
+    assert len({stream.random() for stream in streams}) == 1
+
+
+@pytest.mark.parametrize(
+    ("loss", "seconds", "expected"),
+    [(0.0, 5.0, "expected 0 with"), (1.0, 5.0, "expected 0 with"), (0.9, 0.2, "expected more seconds")],
+)
+def test_outages_that_cannot_be_are_refused(loss: float, seconds: float, expected: str) -> None:
+    """Contacts that never or always fail have no outages, and nine tenths of the time needs long ones."""
+    with pytest.raises(ValueError, match=f"comm_outage_seconds: {expected}"):
+        EnvConfig(comm_loss=loss, comm_outage_seconds=seconds)
+    assert EnvConfig(comm_loss=0.9, comm_outage_seconds=1.0).comm_outage_seconds == 1.0
+
+
+def test_outages_are_part_of_the_state() -> None:
+    """An environment that restores a state in the middle of an outage has the same contacts from then on."""
+    env, twin = (small_env(comm_loss=0.5, comm_outage_seconds=2.0, max_cycles=200) for _ in range(2))
+    drive(env, 30)
+    twin.set_state(env.get_state())
+    for _ in range(60):
+        for each in (env, twin):
+            each.step(turning(each.agents))
+        np.testing.assert_array_equal(env.readings[0].contacts, twin.readings[0].contacts)
 
 
 def test_the_stream_of_the_radio_does_not_depend_on_where_robots_are() -> None:
     """Out of range or not, a tick draws as much."""
     streams = [np.random.default_rng(1) for _ in range(2)]
     for stream, limit in zip(streams, (None, 0.1), strict=True):
-        contacts(POSES, WALLS, limit, True, 0.3, stream)
+        contacts(POSES, WALLS, limit, True, next_failures(None, 3, 0.3, 0.0, stream))
     assert streams[0].random() == streams[1].random()
 
 
