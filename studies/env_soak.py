@@ -101,6 +101,7 @@ def random_config(rng: np.random.Generator) -> EnvConfig:
         oracle_pose=bool(rng.random() < 0.1),
         oracle_association=bool(rng.random() < 0.2),
         oracle_merge=bool(rng.random() < 0.2),
+        oracle_floor=bool(rng.random() < 0.2),
         comm_range=None if rng.random() < 0.5 else float(rng.uniform(3.0, 12.0)),
         comm_line_of_sight=bool(rng.random() < 0.2),
         comm_loss=loss,

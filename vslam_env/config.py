@@ -182,6 +182,7 @@ class EnvConfig:
         oracle_association: Whether data association is replaced by the truth.
         oracle_merge: Whether groups in contact that share three true landmarks merge with the true transform, and only
             these.
+        oracle_floor: Whether the occupancy grid of each robot begins with the true floor plan.
         comm_range: Largest distance of two robots in contact [m]; None: unlimited.
         comm_line_of_sight: Whether walls block contacts.
         comm_loss: Share of the time in which a contact fails, for each pair of robots.
@@ -218,6 +219,7 @@ class EnvConfig:
     oracle_pose: bool = False
     oracle_association: bool = False
     oracle_merge: bool = False
+    oracle_floor: bool = False
     comm_range: float | None = None
     comm_line_of_sight: bool = False
     comm_loss: float = 0.0
@@ -256,7 +258,14 @@ class EnvConfig:
         check_one_limit(self.max_cycles, self.max_seconds)
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
-        switches = ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view", "shared_reward")
+        switches = (
+            "oracle_pose",
+            "oracle_association",
+            "oracle_merge",
+            "oracle_floor",
+            "shared_start_view",
+            "shared_reward",
+        )
         for name in (*switches, "comm_line_of_sight", "observe_images"):
             if not isinstance(getattr(self, name), bool):
                 raise argument_error(name, "True or False", getattr(self, name), "Give a bool.")

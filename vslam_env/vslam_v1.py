@@ -48,6 +48,7 @@ def parallel_env(
     shared_reward: bool | None = None,
     observation_keys: str | Collection[str] | None = None,
     comm_outage_seconds: float | None = None,
+    oracle_floor: bool | None = None,
 ) -> ExplorationEnv:
     """Make the parallel environment, see `ExplorationEnv` for the task.
 
@@ -85,6 +86,7 @@ def parallel_env(
         observation_keys: `"driver"`, `"goal"` or `"all"`, sets of keys, or keys in any order; default: those of
             `config`, without one `"goal"` with `goal` actions, else `"driver"`.
         comm_outage_seconds: Mean duration for which a contact fails [s]; default 0, drawn in each tick by itself.
+        oracle_floor: Whether the occupancy grid of each robot begins with the true floor plan.
 
     Raises:
         ValueError: If an argument is invalid; the message names it.
@@ -115,6 +117,7 @@ def parallel_env(
         "oracle_pose": oracle_pose,
         "oracle_association": oracle_association,
         "oracle_merge": oracle_merge,
+        "oracle_floor": oracle_floor,
         "comm_range": comm_range,
         "comm_line_of_sight": comm_line_of_sight,
         "comm_loss": comm_loss,

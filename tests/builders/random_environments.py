@@ -67,7 +67,14 @@ def drawn(seed: int) -> Case:
         "max_cycles": int(rng.integers(3, 40)),
         "belief": {"filter": {"num_particles": int(rng.integers(1, 40))}},
     }
-    for name in ("oracle_pose", "oracle_association", "oracle_merge", "comm_line_of_sight", "shared_start_view"):
+    for name in (
+        "oracle_pose",
+        "oracle_association",
+        "oracle_merge",
+        "oracle_floor",
+        "comm_line_of_sight",
+        "shared_start_view",
+    ):
         if rng.random() < 0.2:
             changes[name] = True
     if sensor == "stereo" and changes["observation_type"] == "dict":

@@ -57,6 +57,7 @@ OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
         "comm_range": FROM_ZERO, "comm_loss": SHARE, "comm_outage_seconds": [-1.0, 5.0, NAN],
         "robot_radius": "(0, 200]", "min_start_distance": FROM_ZERO,
         "map_error_cutoff": "[1e-6, 1e6]", "comm_line_of_sight": [1], "oracle_pose": ["yes", 1], "oracle_merge": [1],
+        "oracle_floor": [1],
         "shared_start_view": [0.0], "shared_reward": ["yes"], "sensor": ["sonar"], "action_type": ["jump"],
         "observation_type": ["image"], "belief": [5], "stereo": [StereoCamera()], "world": [3], "reward": [1.0],
     }),

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from builders.environments import MEETING, room, small_env, turning
 
-from slam_backend.geometry import between, compose, inverse
+from slam_backend.geometry import between, compose, inverse, transform_points
 from vslam_env import World, vslam_v0
 from vslam_env.actions import DISCRETE_COMMANDS, checked_actions
+from vslam_env.navigation import FREE, OCCUPIED, cell_of
+from vslam_env.simulation.episode import points_along
 
 BARE = World("bare", [[0, 0, 9, 0], [9, 0, 9, 7], [9, 7, 0, 7], [0, 7, 0, 0]])
 
@@ -216,6 +218,22 @@ def test_oracle_merge_is_exact_and_alone() -> None:
     infos = env.step(turning(env.possible_agents))[4] if env.agents else None
     assert infos is not None
     assert all(info["merges"] == 1 and info["group_size"] == 2 and info["group"] == 0 for info in infos.values())
+
+
+def test_robots_that_know_the_floor_begin_with_it() -> None:
+    """With `oracle_floor` all free floor is free and all walls are occupied in all grids; landmarks are not known."""
+    env = small_env(oracle_floor=True)
+    _, infos = env.reset(seed=1)
+    episode = env.episode
+    for robot, agent in enumerate(env.agents):
+        frame, cells = inverse(env.true_start_poses[robot]), env.belief(agent).grid.cells
+        for places, state in ((points_along(env.world.walls, 0.1), OCCUPIED), (episode.scenario.cells, FREE)):
+            at = cell_of(transform_points(frame, places), len(cells))
+            assert np.mean(cells[tuple(at.T)] == state) > 0.98  # but where a turned cell holds floor and a wall
+        assert infos[agent]["map_recall"] < 0.3
+    twin = small_env(oracle_floor=True)
+    twin.set_state(env.get_state())
+    np.testing.assert_array_equal(twin.belief("robot_0").grid.cells, env.belief("robot_0").grid.cells)
 
 
 def test_an_oracle_merge_is_not_corrected_by_landmarks() -> None:

@@ -21,8 +21,9 @@ from vslam_env.navigation import GRID_SIZE
 ATTEMPT_EVERY = 10  # [ticks], at the end of a step
 CANNOT = {  # options of the environment with the only value that batched teams know
     "sensor": "landmark", "oracle_pose": False, "oracle_association": False, "oracle_merge": False,
-    "shared_start_view": False, "shared_reward": False, "comm_range": None, "comm_line_of_sight": False,
-    "comm_outage_seconds": 0.0, "stop_at_recall": None, "observe_images": False, "reward": {"map_error": 1.0},
+    "oracle_floor": False, "shared_start_view": False, "shared_reward": False, "comm_range": None,
+    "comm_line_of_sight": False, "comm_outage_seconds": 0.0, "stop_at_recall": None, "observe_images": False,
+    "reward": {"map_error": 1.0},
 }  # fmt: skip
 
 

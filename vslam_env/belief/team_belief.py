@@ -156,6 +156,16 @@ class TeamBelief:
                 self._renew_candidates(turns)
         return report
 
+    def know_floor(self, free: Sequence[FloatArray], walls: Sequence[FloatArray]) -> None:
+        """Enter a floor plan into the grid of each robot.
+
+        Args:
+            free: (n, 2) float64 [m] for each robot, its start frame. Places on the free floor.
+            walls: (m, 2) float64 [m] for each robot, its start frame. Places on walls.
+        """
+        for grid, *places in zip(self.grids.grids, free, walls, strict=True):
+            grid.enter(*places)
+
     def _renew_candidates(self, robots: Iterable[int]) -> None:
         """Find the candidates of some robots."""
         team_poses = self.team_poses

@@ -207,6 +207,24 @@ class OccupancyGrid:
         grid.cells[here] = _CELL_STATES[grid.evidence[here].view(np.uint8)]
         grid.bounds[:] = known_bounds(grid.cells)
 
+    def enter(self, free: ArrayLike, occupied: ArrayLike) -> None:
+        """Enter places as if scans had shown them as often as counts.
+
+        Args:
+            free: (n, 2) float64 [m], start frame.
+            occupied: (m, 2) float64 [m], start frame. Cells that contain both are occupied.
+        """
+        self._refuse_if_read_only()
+        places = [np.asarray(points, np.float64).reshape(-1, 2) for points in (free, occupied)]
+        self._reserve(max(float(np.abs(points).max(initial=0.0)) for points in places))
+        grid, size = self._grid, self._storage.size
+        for points, evidence in zip(places, (MOST_FREE, MOST_OCCUPIED), strict=True):
+            cells = cell_of(points, size)
+            there = tuple(cells[((cells >= 0) & (cells < size)).all(axis=1)].T)
+            grid.evidence[there] = evidence
+            grid.cells[there] = _CELL_STATES[np.int8(evidence).view(np.uint8)]
+        grid.bounds[:] = known_bounds(grid.cells)
+
     def copy(self) -> "OccupancyGrid":
         """Return an independent, writable grid with the same content."""
         grid = OccupancyGrid()

@@ -1,5 +1,6 @@
 """Episode: simulation of the world, the sensors, the beliefs and the ground-truth association, tick by tick."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -10,7 +11,7 @@ import numpy as np
 
 from slam_backend.core.read_only import as_constant, as_read_only, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.geometry import between, compose
+from slam_backend.geometry import between, compose, inverse, transform_points
 from slam_backend.maps.alignment import Alignment
 from slam_backend.state import (
     BOOL,
@@ -37,6 +38,7 @@ from vslam_env.evaluation.coverage import CoverageTracker
 from vslam_env.evaluation.map_scores import GroundTruthAssociation, check_claims
 from vslam_env.evaluation.recall_credits import RecallCredits
 from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
+from vslam_env.navigation import CELL
 from vslam_env.reward import OWN_RECALL, RUNNING_COST
 from vslam_env.sensors import RenderedFrame, SensorFrame, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.simulation.communication import contacts, next_failures
@@ -46,6 +48,18 @@ from vslam_env.world import Simulator, read_odometry
 MIN_SHARED = 3
 AROUND = 1.0  # [m] tolerated distance of a robot outside the bounds of the walls
 SIGMA = 1e-4  # [m, rad] standard deviation of a true alignment
+
+
+def points_along(walls: FloatArray, spacing: float) -> FloatArray:
+    """Return points (n, 2) [m] on walls (S, 4) [m], their ends included, at most so far apart [m].
+
+    >>> points_along(np.array([[0.0, 0.0, 0.0, 1.0]]), 0.5).tolist()
+    [[0.0, 0.0], [0.0, 0.5], [0.0, 1.0]]
+    """
+    return np.concatenate([
+        np.linspace(wall[:2], wall[2:], 1 + max(1, math.ceil(float(np.hypot(*(wall[2:] - wall[:2]))) / spacing)))
+        for wall in walls
+    ])  # fmt: skip
 
 
 def true_alignment(
@@ -167,7 +181,13 @@ class Episode:
         self.last_frames: TeamSensorFrames | TeamRenderedFrames  # set by `begin`
 
     def begin(self) -> None:
-        """Take the first measurements."""
+        """Take the first measurements; robots that shall know the floor plan do so from now on."""
+        if self._config.oracle_floor:
+            frames = [inverse(start) for start in self.true_starts]
+            walls = points_along(self.world.walls, 0.5 * CELL)
+            self.belief.know_floor(
+                *([transform_points(frame, places) for frame in frames] for places in (self.scenario.cells, walls))
+            )
         no_goals = np.full((len(self.true_starts), 2), np.nan)
         self._perceive(None, no_goals if self._config.action_type == "goal" else None)
 

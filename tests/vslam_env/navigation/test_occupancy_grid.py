@@ -345,3 +345,20 @@ def test_a_combined_update_equals_its_parts() -> None:
             assert (evidence_of(whole, GRID_SIZE) == evidence_of(part, GRID_SIZE)).all()
             assert (whole.cells == part.cells).all()
             assert (team.cells[robot] == part.cells).all()
+
+
+def test_places_are_entered_as_if_seen_often() -> None:
+    """Cells of places are free or occupied, occupied where both are, the grid grows, and one scan changes none."""
+    grid = OccupancyGrid()
+    grid.enter([[1.0, 1.0], [2.0, 1.0], [-45.0, 3.0]], [[2.05, 1.05], [0.0, 55.0]])
+    size = len(grid.cells)
+    assert size > GRID_SIZE
+    states = {(1.0, 1.0): FREE, (-45.0, 3.0): FREE, (2.0, 1.0): OCCUPIED, (0.0, 55.0): OCCUPIED, (5.0, 5.0): UNKNOWN}
+    for place, state in states.items():
+        assert grid.cells[tuple(cell_of(place, size))] == state
+    top, left, bottom, right = grid.bounds
+    assert (grid.cells != UNKNOWN).sum() == (grid.cells[top:bottom, left:right] != UNKNOWN).sum() == 4
+    grid.update_from_scan([1.0, 1.0, 0.0], np.full(len(ANGLES), MAX_RANGE), ANGLES, MAX_RANGE)
+    assert grid.cells[tuple(cell_of([2.0, 1.0], size))] == OCCUPIED
+    with pytest.raises(RuntimeError, match="read-only"):
+        grid.read_only_view().enter([], [])
