@@ -3,12 +3,13 @@
 python -m studies.moving_picture                  # docs/figures/episode.webp, about a minute
 python -m studies.moving_picture --seed 1 --out other.webp
 python -m studies.moving_picture --policy learned --beside next_best_view --out both.webp   # the same world twice
+python -m studies.moving_picture --preset hard --beside-file old.webp --out both.webp       # beside another version
 """
 
 import argparse
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from training.episodes.config import RunConfig
 from training.episodes.runner import Progress, run_episode
@@ -66,7 +67,10 @@ def main() -> None:
     parser.add_argument("--world", default="office")
     parser.add_argument("--world-split", choices=("train", "validation", "test"))
     parser.add_argument("--policy", default="frontier")
-    parser.add_argument("--beside", metavar="POLICY", help="second policy, in the same world")
+    second = parser.add_mutually_exclusive_group()
+    second.add_argument("--beside", metavar="POLICY", help="second policy, in the same world")
+    second.add_argument("--beside-file", metavar="WEBP", type=Path, help="moving picture of another version")
+    parser.add_argument("--preset", choices=("easy", "standard", "hard"), default="standard")
     parser.add_argument("--action-type", choices=("continuous", "discrete", "goal"), default="continuous")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--max-seconds", type=float, default=120.0)
@@ -75,12 +79,15 @@ def main() -> None:
         film(
             RunConfig(
                 world=options.world, world_split=options.world_split, policy=policy, seed=options.seed,
-                max_seconds=options.max_seconds, action_type=options.action_type,
+                max_seconds=options.max_seconds, action_type=options.action_type, preset=options.preset,
             )
         )
         for policy in (options.policy, options.beside)
         if policy is not None
     ]  # fmt: skip
+    if options.beside_file is not None:
+        with Image.open(options.beside_file) as picture:
+            episodes.append([frame.convert("RGB") for frame in ImageSequence.Iterator(picture)])
     frames = with_few_colours(episodes[0] if len(episodes) == 1 else side_by_side(*episodes))
     durations = [round(1e3 / FPS)] * (len(frames) - 1) + [round(1e3 * LINGER)]
     frames[0].save(

@@ -19,17 +19,23 @@ if TYPE_CHECKING:  # numerical modules are imported when the command runs, so th
     from training.bench.exploration.plan import Plan
 
 COMMAND = "bench exploration"
-EPISODES_CSV, EPISODES_PARQUET = "episodes.csv", "episodes.parquet"
 OPEN = ("policies", "decision_limit")  # options that a plan leaves open
 
 PlanName = Annotated[
-    str | None, typer.Option(help="Plan of a benchmark: vslam-bench-v0, or a TOML file.", show_default="none")
+    str | None, typer.Option(help="Plan of a benchmark: vslam-bench-v1, or a TOML file.", show_default="none")
 ]
+Tracks = Annotated[
+    str | None, typer.Option(help="Tracks of --plan, with commas between their names.", show_default="all")
+]
+Base = Annotated[bool, typer.Option("--base", help="Play only the episodes of --plan that a row needs.")]
 Verified = Annotated[
     Path | None, typer.Option(help="Run folder whose episodes are played again and compared.", show_default=False)
 ]
 VerifiedRows = Annotated[
-    int, typer.Option("--rows", help="Number of episodes of each policy that --verify plays.", min=1)
+    int | None,
+    typer.Option(
+        "--rows", help="Number of episodes of each policy that --verify plays.", min=1, show_default="a tenth"
+    ),
 ]
 
 
@@ -40,24 +46,27 @@ def is_plan_run(call: Call[ExplorationConfig]) -> bool:
     return call.file is not None and "plan" in read_config(call.file, COMMAND)[0]
 
 
-def run_plan(call: Call[ExplorationConfig], name: str | None, workers: int, cluster: str | None) -> None:
+def run_plan(
+    call: Call[ExplorationConfig], name: str | None, tracks: str | None, base: bool, workers: int, cluster: str | None
+) -> None:
     """Play the episodes of a plan that the run folder does not contain yet, and write its tables."""
     from slam_backend.core.text_files import read_text
+    from training.bench.exploration.episodes import CSV, PARQUET, episodes_csv, write_parquet
     from training.bench.exploration.plan import PLAN_COPY, PlanBench, PlanTrial
-    from training.bench.exploration.plan_report import draw_plan, episodes_csv, markdown, ordered, tables, write_parquet
+    from training.bench.exploration.plan_report import draw_plan, markdown, ordered, tables
     from training.bench.exploration.trials import check_same_policies, checks, play
     from training.experiments.numerics import PORTABLE, variables_for
     from training.experiments.policy_names import check_named
     from training.experiments.tables import E_SCALE
 
-    config, plan = _configured(call, name)
+    config, plan = _configured(call, name, tracks, base)
     _check_same_plan(call.out, plan)
-    trials = plan.trials(config.policies, config.quick)
+    trials = plan.trials(config.policies, config.tracks, config.extent)
     check_named((trial.policy for trial in trials), call.given.get("policies"))
     check_same_policies(call.out, {trial.policy for trial in trials})
     bench = PlanBench(plan, config.decision_limit)
-    first_part = [trial for trial in trials if trial.part == trials[0].part]
-    console, folder = call.begin(*checks(bench, first_part), config=config)
+    first = [trial for trial in trials if (trial.track, trial.relaxation) == (trials[0].track, trials[0].relaxation)]
+    console, folder = call.begin(*checks(bench, first), config=config)
     if (file := Path(config.plan)).is_file():
         folder.write_text(PLAN_COPY, read_text(file, "plan", "a TOML file"))
     if missing := plan.missing_floor_plans():
@@ -68,31 +77,33 @@ def run_plan(call: Call[ExplorationConfig], name: str | None, workers: int, clus
         variables=variables_for(PORTABLE),
     )  # fmt: skip
     rows = run_trial_set(console, folder, part)
-    found = [(table, lines) for table in tables(plan, rows) if (lines := table.lines(ordered(rows)))]
+    found = [(table, lines) for table in tables(plan, rows) if (lines := table.lines(ordered(plan, rows)))]
     for table, lines in found[:1]:  # as far as it fits into 80 columns
-        print_table(console, replace(table, columns=table.columns[:3]), lines)
+        print_table(console, replace(table, columns=table.columns[:2]), lines)
     console.print(E_SCALE)
     by_name = {table.name: plain_lines(lines) for table, lines in found}
     call.write({"plan": plan.name, "plan_hash": plan.digest, "tables": by_name})
-    folder.write_text(EPISODES_CSV, episodes_csv(rows))
-    if rows and not write_parquet(folder.path / EPISODES_PARQUET, rows):
-        text = f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
+    folder.write_text(CSV, episodes_csv(rows))
+    if rows and not write_parquet(folder.path / PARQUET, rows):
+        text = f"{PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
         console.print(text, soft_wrap=True)
     folder.write_text("tables.md", markdown(plan, rows, config.policies or plan.policies))
-    draw_plan(folder.path / "plan.png", rows)
+    draw_plan(folder.path / "plan.png", plan, rows)
     call.finish()
     if part.failures:
         raise typer.Exit(2)
 
 
-def _configured(call: Call[ExplorationConfig], name: str | None) -> "tuple[PlanConfig, Plan]":
+def _configured(
+    call: Call[ExplorationConfig], name: str | None, tracks: str | None, base: bool
+) -> "tuple[PlanConfig, Plan]":
     """Return the configuration of a run of a plan, and the plan.
 
     Raises:
         ValueError: If an option is given that the plan fixes, or the plan has changed since the run in --config.
     """
     from slam_backend.core.validation import argument_error
-    from training.bench.exploration.plan import Plan
+    from training.bench.exploration.plan import BASE, QUICK, Plan
     from training.experiments.policy_names import check_configuration
     from training.experiments.run_folder import read_config
 
@@ -104,7 +115,10 @@ def _configured(call: Call[ExplorationConfig], name: str | None) -> "tuple[PlanC
     check_configuration(earlier, call.given)
     values = earlier | {key: call.given[key] for key in OPEN if key in call.given}
     values |= {"plan": name} if name is not None else {}
-    values |= {"quick": True} if call.quick else {}
+    if call.quick and base:
+        raise argument_error("base", "no value with --quick", True, "Give one of the two.")
+    values |= {"extent": QUICK if call.quick else BASE} if call.quick or base else {}
+    values |= {"tracks": tuple(name.strip() for name in tracks.split(","))} if tracks is not None else {}
     plan = Plan.load(values["plan"])
     config = PlanConfig.from_mapping(values | {"plan_hash": plan.digest})
     if earlier.get("plan") == config.plan and earlier["plan_hash"] != plan.digest:
@@ -130,7 +144,7 @@ def _check_same_plan(out: Path | None, plan: "Plan") -> None:
         raise argument_error("out", f"results of vslam-env {now}", f"results of {before}", hint)
 
 
-def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int, workers: int) -> None:
+def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int | None, workers: int) -> None:
     """Play some episodes of each policy of a run again, and compare them with what the run stored.
 
     Processes that play them have the numerics of the stored ones, where this processor can do these.
@@ -141,7 +155,7 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int, workers
     import numpy as np
 
     from slam_backend.core.validation import argument_error
-    from training.bench.exploration.leaderboard import kept_episodes
+    from training.bench.exploration.episodes import kept_episodes
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import Bench, play
     from training.bench.exploration.verification import TABLE, choose, compare, keep
@@ -161,7 +175,7 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int, workers
     else:
         bench = ExplorationConfig.from_mapping(values | {"seed": seed})
     stored = finished_trials(folder / TRIALS_FILE, kind)
-    chosen = choose(list(stored.values()) or kept_episodes(folder) or [], count, np.random.default_rng())
+    chosen = choose(list(stored.values()) or kept_episodes(folder, "verify") or [], count, np.random.default_rng())
     if not chosen or any("digest" not in row for row in chosen):
         hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."
         raise argument_error("verify", "a run folder whose episodes have digests", "none", hint)
@@ -198,12 +212,12 @@ def write_leaderboard(folders: list[Path], out: Path) -> None:
     """Write the tables of all results in some run folders of one plan, and their figure beside the page.
 
     Raises:
-        ValueError: If a folder has no results of a plan, they are incomplete, plans differ, or two folders have
+        ValueError: If a folder has no results of a plan, they are no whole results, plans differ, or two folders have
             different policies of the same label.
     """
     from slam_backend.core.files import write_file
     from slam_backend.core.validation import argument_error
-    from training.bench.exploration.leaderboard import leaderboard, played_rows, read_results
+    from training.bench.exploration.leaderboard import latest_rows, leaderboard, read_results
     from training.bench.exploration.plan_report import draw_plan
 
     results = [read_results(folder) for folder in folders]
@@ -213,5 +227,16 @@ def write_leaderboard(folders: list[Path], out: Path) -> None:
             raise argument_error("folders", f"results of plan {results[0].plan.digest}", each.plan.digest, hint)
     figure = out.with_suffix(".png")
     write_file(out, leaderboard(results, figure.name), "out")
-    draw_plan(figure, played_rows(results))
+    draw_plan(figure, results[0].plan, latest_rows(results))
     typer.echo(f"Leaderboard: {out}")
+
+
+def write_submission(folder: Path, out: Path) -> None:
+    """Write the files of a submission, and say what to do with them."""
+    from training.bench.exploration.players import label
+    from training.bench.exploration.submission import submit
+
+    results = submit(folder, out)
+    policies = ", ".join(label(policy) for policy in dict.fromkeys(row["policy"] for row in results.rows))
+    typer.echo(f"Submission of {policies}: {out}")
+    typer.echo(f"Add this folder to benchmarks/{results.plan.name} in a pull request.")

@@ -9,13 +9,16 @@ from training.bench.exploration.config import ExplorationConfig
 from training.bench.speed.config import BatchedSpeedConfig, EnvSpeedConfig, FilterSpeedConfig, StartSpeedConfig
 from training.commands._options import Cluster, Workers, options
 from training.commands._plan import (
+    Base,
     PlanName,
+    Tracks,
     Verified,
     VerifiedRows,
     is_plan_run,
     run_plan,
     verify_rows,
     write_leaderboard,
+    write_submission,
 )
 from training.commands._run_folder import Call
 from training.commands.study import run_study
@@ -27,15 +30,15 @@ bench = typer.Typer(help="Compare policies, and measure the speed of filters and
 @options(
     ExplorationConfig, "bench exploration", continues=True,
     quick={"worlds": ("office",), "duration": 60.0, "seeds": 3},
-    quick_help="Office worlds only, 60 s, 3 seeds; with --plan 2 worlds of four families.",
+    quick_help="Office worlds only, 60 s, 3 seeds; with --plan 2 seeds of each track.",
 )  # fmt: skip
 def bench_exploration(
-    call: Call[ExplorationConfig], plan: PlanName = None, workers: Workers = 1, ray: Cluster = None,
-    verify: Verified = None, verified_rows: VerifiedRows = 5,
+    call: Call[ExplorationConfig], plan: PlanName = None, tracks: Tracks = None, base: Base = False,
+    workers: Workers = 1, ray: Cluster = None, verify: Verified = None, verified_rows: VerifiedRows = None,
 ) -> None:  # fmt: skip
     """Compare policies over worlds: coverage, map errors, pose errors and merges, with confidence intervals.
 
-    With --plan, the plan of a benchmark fixes all but the policies; --quick then plays two worlds of four families.
+    With --plan, the plan of a benchmark fixes all but the policies; --quick then plays two seeds of each track.
     With --verify, episodes of a finished run are played again: all bits are compared where versions
     are the same and this processor can do the same, all numbers elsewhere.
 
@@ -48,8 +51,13 @@ def bench_exploration(
         verify_rows(call, verify, verified_rows, workers)
         return
     if plan is not None or is_plan_run(call):
-        run_plan(call, plan, workers, ray)
+        run_plan(call, plan, tracks, base, workers, ray)
         return
+    if tracks is not None or base:
+        from slam_backend.core.validation import argument_error
+
+        name = "tracks" if tracks is not None else "base"
+        raise argument_error(name, "a plan with it", "no --plan", "Add --plan vslam-bench-v1.")
     from training.bench.exploration.report import STUDY
     from training.bench.exploration.trials import check_same_policies
 
@@ -64,6 +72,15 @@ def bench_leaderboard(
 ) -> None:
     """Write the leaderboard of a benchmark plan from the results in run folders."""
     write_leaderboard(folders, out)
+
+
+@bench.command("submit")
+def bench_submit(
+    folder: Annotated[Path, typer.Argument(help="Run folder of a plan, with the episodes of its base part.")],
+    out: Annotated[Path, typer.Option(help="New folder of the submission.")] = Path("submission"),
+) -> None:
+    """Pack the results of a run on a benchmark plan with its policies, versions and digests."""
+    write_submission(folder, out)
 
 
 speed = typer.Typer(help="Time steps of filters and environments, and the start-up.", no_args_is_help=True)

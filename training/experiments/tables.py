@@ -4,6 +4,7 @@ The first column of a table is left-aligned, numbers are right-aligned and have 
 """
 
 import csv
+import html
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -120,6 +121,16 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
     """
     rule = ["---", *["---:"] * (len(headings) - 1)]
     return "".join("| " + " | ".join(row) + " |\n" for row in (headings, rule, *rows))
+
+
+def escaped(text: str) -> str:
+    """Return a text of others so that a Markdown page shows it as it is, in one cell of a table.
+
+    >>> escaped("<b>a|b</b>")
+    '&lt;b&gt;a&#124;b&lt;/b&gt;'
+    """
+    marks = {ord(mark): f"&#{ord(mark)};" for mark in "|`[]*_\\"}
+    return html.escape(" ".join(text.split()), quote=False).translate(marks)
 
 
 def csv_text(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -84,7 +84,7 @@ def test_trials_import_no_policy_that_is_not_named(label: str, folder: Path, vsl
 
 def test_a_plan_imports_no_policy_that_is_not_named(folder: Path, vslam: Any) -> None:
     """A plan of another person does not choose what is imported, until the command line names it, too."""
-    text = (Path(exploration.__file__).parent / "plans" / "vslam-bench-v0.toml").read_text(encoding="utf-8")
+    text = (Path(exploration.__file__).parent / "plans" / "vslam-bench-v1.toml").read_text(encoding="utf-8")
     plan = re.sub(r"(?ms)^policies = \[.*?^\]", 'policies = ["frontier", "strange_still:Still"]', text, count=1)
     assert "strange_still" in plan
     (folder / "plan.toml").write_text(plan, encoding="utf-8")

@@ -32,7 +32,7 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     speed.EnvSpeedConfig: {"worlds": ("fig5",)},
     exploration.ExplorationConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     speed.FilterSpeedConfig: {"proposals": ("fastslam1",), "large": True},
-    exploration.PlanConfig: {"plan": "vslam-bench-v0", "policies": ("frontier",), "quick": True},
+    exploration.PlanConfig: {"plan": "vslam-bench-v1", "policies": ("frontier",), "tracks": ("hard",)},
     speed.BatchedSpeedConfig: {"batches": (8, 16), "rows": 64},
     BatchedTrainConfig: {"world": "maze", "batch": 64, "minutes": 4.0, "learning_rate": 1e-3},
     speed.StartSpeedConfig: {"parts": ("import",), "repeats": 1}, stereo.Config: {"descriptors": ("orb",)},

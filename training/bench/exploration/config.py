@@ -98,18 +98,21 @@ class ExplorationConfig(ExperimentConfig):
         from training.bench.exploration.players import environment_of
 
         return environment_of(
-            trial, trial.world, self.split, self.duration, particles=self.particles,
-            rejuvenate_every=self.rejuvenate_every, preset=self.preset, sensor=self.sensor,
+            trial.policy, trial.oracle, trial.world, self.split, robots=trial.robots, max_seconds=self.duration,
+            particles=self.particles, rejuvenate_every=self.rejuvenate_every, preset=self.preset, sensor=self.sensor,
         )  # fmt: skip
 
 
 class PlanConfig(ExperimentConfig):
     """Run of a benchmark plan, which fixes all but the policies."""
 
-    plan: str = setting("vslam-bench-v0", "Name or TOML file of the plan.")
+    plan: str = setting("vslam-bench-v1", "Name or TOML file of the plan.")
     plan_hash: str = setting("", "Hash of the plan's content.")
     policies: tuple[str, ...] | None = setting(None, "Labels of the policies; None: those of the plan.")
-    quick: bool = setting(False, "Whether only the first seeds of the base part are played.")
+    tracks: tuple[str, ...] | None = setting(None, "Names of the tracks; None: all.")
+    extent: Literal["all", "base", "quick"] = setting(
+        "all", "Episodes that are played: all, those that a row needs (base), or a few (quick)."
+    )
     decision_limit: float = setting(2.0, "Longest time of a decision [s].", gt=0.0)
 
     def check(self) -> None:

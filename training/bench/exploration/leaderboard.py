@@ -1,31 +1,34 @@
-"""Leaderboard of a benchmark plan, generated from kept results."""
+"""Leaderboard of a benchmark plan, generated from kept results that anybody may have written."""
 
-import gzip
+import re
 import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import argument_error
-from training.bench.exploration.plan import BASE_PART, FLOOR_PLANS, Plan
-from training.bench.exploration.plan_report import incomplete, markdown, read_episodes, section
-from training.bench.exploration.players import label
-from training.bench.exploration.verification import OUTCOMES, last_outcomes
+from training.bench.exploration.episodes import kept_episodes
+from training.bench.exploration.plan import BASE, FLOOR_PLANS, Plan, PlanTrial
+from training.bench.exploration.plan_report import incomplete, markdown, shown
+from training.bench.exploration.verification import COMMAND as VERIFY
+from training.bench.exploration.verification import OUTCOMES, TENTH, replayed
 from training.experiments.run_folder import read_config
 from training.experiments.statistics import grouped
 from training.experiments.study import Column, ResultTable
+from training.experiments.tables import escaped, markdown_table
+from training.experiments.trial_store import trial_of
 
-EPISODES = ("episodes.csv", "episodes.csv.gz")
+COMMAND = "bench exploration"
 ABOUT = (
-    "Made by `vslam bench leaderboard` from folders of results; this project keeps its own in "
-    "`benchmarks/vslam-bench-v0`. `docs/how-to/exploration.md` describes the policies, `docs/reference/metrics.md` the "
-    "columns, `docs/how-to/benchmark.md` how to add a row.\n"
+    "Made by `vslam bench leaderboard` from folders of results. `docs/how-to/exploration.md` describes the policies, "
+    "`docs/reference/metrics.md` the columns, `docs/how-to/benchmark.md` the tracks and how to add a row.\n"
 )
-PICTURE = "Share of worlds below each map error, and map error over the number of robots and particles"
+PICTURE = "Share of worlds below each map error"
+Rows = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,99 +36,132 @@ class Results:
     """Results of some policies on a plan."""
 
     plan: Plan
-    rows: Sequence[Mapping[str, Any]]  # A row per episode
-    verified: Mapping[str, Sequence[int]]  # Numbers of `OUTCOMES` by policy, see `last_outcomes`
+    rows: Rows  # A row per episode
+    again: Mapping[str, Sequence[int]]  # Numbers of `OUTCOMES` of episodes played again, by policy
 
 
 def read_results(folder: Path) -> Results:
     """Read the results in a run folder of a plan; `episodes.csv` may be compressed.
 
     Raises:
-        ValueError: If there are none, they are incomplete, or the installed plan of that name has another hash.
+        ValueError: If there are none, a row is damaged, out of range, of no episode of the plan, of another task, or
+            there twice; or a policy lacks episodes of the base part, or has those of several versions.
     """
-    values, _ = read_config(folder, "bench exploration", "folders")
+    values, _ = read_config(folder, COMMAND, "folders")
     rows = kept_episodes(folder)
     if rows is None or "plan" not in values:
         hint = "Run vslam bench exploration --plan."
         raise argument_error("folders", "results of a plan", f"none in {str(folder)!r}", hint)
     plan = Plan.of_run(folder, values, "folders")
-    if values.get("quick"):
-        hint = "Play without --quick, in a new folder."
-        raise argument_error("folders", "complete results", f"those of --quick in {str(folder)!r}", hint)
-    if lacking := incomplete(plan, rows, values.get("policies") or plan.policies):
-        hint = f"Resume the run in {str(folder)!r}."
+    _check_rows(plan, rows, folder)
+    if lacking := incomplete(plan, rows, ()):
+        hint = f"Resume the run in {str(folder)!r}, without --quick."
         raise argument_error("folders", "complete results", f"a folder in which {lacking[0]}", hint)
-    return Results(plan, rows, last_outcomes(folder))
+    return Results(plan, rows, replayed(folder, rows))
 
 
-def kept_episodes(folder: Path) -> list[dict[str, Any]] | None:
-    """Return the rows of `episodes.csv` or its compressed form in a folder, or None if there is neither."""
-    file = next((folder / name for name in EPISODES if (folder / name).is_file()), None)
-    if file is None:
-        return None
-    is_packed = file.suffix == ".gz"
-    return read_episodes(gzip.decompress(file.read_bytes()).decode() if is_packed else read_text(file, "folders"))
+def _check_rows(plan: Plan, rows: Rows, folder: Path) -> None:
+    """Refuse rows that are not those of the plan's episodes, each once."""
+    policies = list(dict.fromkeys(row["policy"] for row in rows))
+    known, seen, digests = set(plan.trials(policies, with_missing=True)), Counter[PlanTrial](), Counter[Any]()
+    for row in rows:
+        trial = trial_of(row, PlanTrial)
+        about = f"{trial.track}, {trial.world}, seed {trial.seed}, of {trial.policy!r}"
+        if trial not in known:
+            raise argument_error("folders", "episodes of the plan", about, f"Remove it from {str(folder)!r}.")
+        seen[trial] += 1
+        played = trial.policy, trial.track, trial.relaxation, row["digest"]  # tracks may share episodes
+        digests[played] += 1
+        if seen[trial] > 1 or digests[played] > 1:
+            hint = f"Play the episode again in {str(folder)!r}."
+            raise argument_error("folders", "each episode once", f"one or its digest twice: {about}", hint)
+        if (task := plan.task_of(trial)) is not None and row["task"] != task:
+            hint = "The world, the starts or the readings differ: use the release of the plan."
+            raise argument_error("folders", f"an episode with the task {task}", f"{row['task']} in {about}", hint)
+    for (policy,), own in grouped(rows, ("policy",)).items():
+        for name in ("version", "policy_digest", "action_type"):
+            if len(values := sorted({str(row[name]) for row in own})) > 1:
+                hint = f"Play {policy!r} again in a new folder."
+                raise argument_error("folders", f"one {name} for each policy", ", ".join(values), hint)
+    if newer := [row["version"] for row in rows if _numbers(row["version"]) > _numbers(version("vslam-env"))]:
+        hint = "Use that release."
+        raise argument_error("folders", f"results up to version {version('vslam-env')}", newer[0], hint)
 
 
 def played_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:
-    """Return the rows of the finished parts of all policies.
+    """Return the rows of all policies: their base part, and the tracks and relaxations that are finished.
 
-    A policy in several folders, such as the baseline, counts once, as in the first of them.
+    A policy in several folders, such as the baseline, counts once, as in the first of them with the latest version.
 
     Raises:
-        ValueError: If two folders have different custom policies or models of the same label, or a policy has not
-            played in a family in which another one has.
+        ValueError: If two folders have different custom policies or models of the same label.
     """
-    kept: dict[str, Sequence[Mapping[str, Any]]] = {}
+    kept: dict[str, Rows] = {}
+    plans = {}
     for each in results:
         for (policy,), group in grouped(each.rows, ("policy",)).items():
             sources = {row["policy_digest"] for row in (*kept.get(policy, []), *group)}
             if len(sources) > 1:
                 raise argument_error("folders", "one policy for each label", policy, "Give one of them a LABEL=.")
-            kept.setdefault(policy, _finished(each.plan, policy, group))
-    families = {policy: {row["family"] for row in group if row["part"] == BASE_PART} for policy, group in kept.items()}
-    all_families = set().union(*families.values())
-    for policy, own_families in families.items():
-        if missing := all_families - own_families:
-            hint = "Set VSLAM_DATA, and resume the run." if FLOOR_PLANS in missing else "Resume the run."
-            got = f"none of {policy!r} in {', '.join(sorted(missing))}"
-            raise argument_error("folders", "episodes of all policies in the same families", got, hint)
-    return [row for group in kept.values() for row in group]
+            if policy not in kept or _version(group) > _version(kept[policy]):
+                kept[policy], plans[policy] = group, each.plan
+    return [row for policy, group in kept.items() for row in _finished(plans[policy], policy, group)]
 
 
 def leaderboard(results: Sequence[Results], figure: str) -> str:
-    """Return the page: figure, all tables, and which episodes were played again.
+    """Return the page: figure, all tables of the latest version, and which episodes were played again.
 
     Args:
         results: Results of one plan.
-        figure: Path from the page to the picture that `draw_plan` makes of `played_rows`.
+        figure: Path from the page to the picture that `draw_plan` makes of `latest_rows`.
 
     Raises:
         ValueError: As in `played_rows`.
     """
-    rows = played_rows(results)
-    verified = {policy: counts for each in results for policy, counts in each.verified.items()}
+    rows, plan = latest_rows(results), results[0].plan
+    counts = {policy: each.again[policy] for each in reversed(results) for policy in each.again}
+    older = {row["policy"]: row["version"] for row in played_rows(results)}
+    older = {policy: name for policy, name in older.items() if policy not in {row["policy"] for row in rows}}
     again = ResultTable(
-        name="verification", title="Verification", by=("policy",), words={"policy": ("policy", label)},
-        note="Episodes of each policy that were played again at the last verification: all bits are compared where "
-        "versions are the same and the processor can do the same, all results up to a ten-thousandth elsewhere.",
+        name="status", title="Status", by=("policy", "version"), words={"policy": ("policy", shown)},
         columns=(
-            Column("episodes", statistic=len, digits=0),
+            Column("status", "status", partial(_status, counts)), Column("episodes", statistic=len, digits=0),
             *(
-                Column(outcome, "" if i else f"again: {outcome}", partial(_verified, verified, i), digits=0)
+                Column(outcome, "" if i else f"again: {outcome}", partial(_again, counts, i), digits=0)
                 for i, outcome in enumerate(OUTCOMES)
             ),
         ),
     )  # fmt: skip
+    note = (
+        f"*replayed*: at least {TENTH:.0%} of the episodes were played again by `{VERIFY}`, and none differed: in all "
+        "bits where versions are the same and the processor can do the same, elsewhere in all numbers up to a "
+        "ten-thousandth. *claimed*: fewer were, or some differed."
+    )
     machines = sorted({str(row["machine"]) for row in rows})
     text = "\n".join([
-        "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n",
-        markdown(results[0].plan, rows, ()), section(again, again.lines(rows)), f"Played on: {'; '.join(machines)}.\n",
+        "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n", markdown(plan, rows, ()),
+        f"### {again.title}\n\n{note}\n\n"
+        + markdown_table(again.headings, [again.cells(line) for line in again.lines(rows)]),
+        *(f"Older: `{shown(policy)}`, played by version {escaped(name)}.\n" for policy, name in older.items()),
+        f"Played on: {'; '.join(map(escaped, machines))}.\n",
     ])  # fmt: skip
     return "\n".join(line if line[:1] in "#!|" else _wrapped(line) for line in text.split("\n"))
 
 
-def _verified(counts: Mapping[str, Sequence[int]], outcome: int, rows: Sequence[Mapping[str, Any]]) -> int | None:
+def latest_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:
+    """Return those of `played_rows` that the latest version among them played."""
+    rows = played_rows(results)
+    latest = max(_numbers(row["version"]) for row in rows)
+    return [row for row in rows if _numbers(row["version"]) == latest]
+
+
+def _status(counts: Mapping[str, Sequence[int]], rows: Rows) -> str:
+    """Return whether enough episodes of a policy were played again, all with the same results."""
+    *same, different = counts.get(rows[0]["policy"], (0, 0, 0))
+    return "replayed" if not different and sum(same) >= TENTH * len(rows) else "claimed"
+
+
+def _again(counts: Mapping[str, Sequence[int]], outcome: int, rows: Rows) -> int | None:
     """Return the number of episodes of a policy with an outcome, None if none were played again."""
     return counts[rows[0]["policy"]][outcome] if rows[0]["policy"] in counts else None
 
@@ -134,8 +170,23 @@ def _wrapped(line: str) -> str:
     return textwrap.fill(line, 120, break_long_words=False, break_on_hyphens=False)
 
 
-def _finished(plan: Plan, policy: str, rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the rows of parts of which none is missing; `read_results` checks the base part."""
-    wanted = Counter(trial.part for trial in plan.trials((policy,)))
-    parts = grouped(rows, ("part",)).items()
-    return [row for (part,), own in parts if part == BASE_PART or len(own) >= wanted[part] for row in own]
+def _finished(plan: Plan, policy: str, rows: Rows) -> list[Mapping[str, Any]]:
+    """Return the rows of the base part, and those of tracks, floor plans and relaxations of which none is missing."""
+
+    def part_of(trial: PlanTrial) -> tuple[Any, ...]:
+        is_base = trial in base
+        return is_base, trial.track, trial.relaxation, trial.family == FLOOR_PLANS
+
+    base = set(plan.trials([policy], extent=BASE))
+    wanted = Counter(map(part_of, plan.trials([policy], with_missing=True)))
+    played = Counter(part_of(trial_of(row, PlanTrial)) for row in rows)
+    return [row for row in rows if played[part := part_of(trial_of(row, PlanTrial))] == wanted[part]]
+
+
+def _version(rows: Rows) -> tuple[int, ...]:
+    return _numbers(rows[0]["version"])
+
+
+def _numbers(name: str) -> tuple[int, ...]:
+    """Return the numbers of a version, which order versions."""
+    return tuple(int(part) for part in re.findall(r"\d{1,9}", name)[:4])

@@ -1,59 +1,74 @@
-"""Plans of the exploration benchmark: which episodes every policy plays. A plan is a TOML file, frozen by its hash."""
+"""Plans of the exploration benchmark: which episodes every policy plays, track by track.
+
+A plan is a TOML file, frozen by its hash. It fixes the task: worlds, starts, readings, time, and how maps are scored.
+The estimator is not part of it: rows name the version that played them.
+"""
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from slam_backend.core.text_files import read_toml
-from slam_backend.core.validation import argument_error, choice_error
+from slam_backend.core.validation import argument_error, check_choice, choice_error
 from training.bench.exploration.players import environment_of
-from training.experiments.config import Checked, NoisePreset, Positive, RobotCount
+from training.experiments.config import Checked, NoisePreset, NonNegative, Positive, RobotCount
 
 if TYPE_CHECKING:
     from vslam_env.config import EnvConfig
 
 PLANS = Path(__file__).parent / "plans"
 PLAN_COPY = "plan.toml"  # in run folders of plans that are not shipped
-BASE_PART, FLOOR_PLANS = "base", "floor plans"
+FLOOR_PLANS = "floor plans"
+NO_RELAXATION = "none"
 QUICK_SEEDS = 2
-Oracle = Literal["none", "pose", "association", "merge", "all"]
+ALL, BASE, QUICK = "all", "base", "quick"  # how much of a plan is played
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanTrial:
     """One episode of one policy."""
 
-    part: str  # Part of the plan
+    track: str  # Track of the plan
     policy: str  # Label, see `parted`
-    family: str  # World as the part names it
+    family: str  # World as the track names it
     world: str  # Family, or file name of a floor plan
     robots: int  # K
-    particles: int  # M
-    oracle: str  # Ground truth given to the robots
-    preset: str  # Noise preset
-    comm_loss: float | None  # Probability that a contact fails; None: that of the preset
-    duration: float  # Simulated time [s]
+    relaxation: str  # Limit that is relaxed
     seed: int  # Seed of the episode
 
 
-class PlanPart(Checked):
-    """Part of a plan: all combinations of its lists, with every policy."""
+class Track(Checked):
+    """Track of a plan: all combinations of its lists, with every policy."""
 
     title: str
     worlds: tuple[str, ...] = ("office", "maze", "loops", "hall")
-    seeds: Positive
+    seeds: Positive  # Episodes in each world
+    base: NonNegative = 0  # First of these, which a row of the leaderboard needs; floor plans are not among them
+    relaxed: NonNegative = 0  # First of these, which are also played with each limit relaxed
     robots: tuple[RobotCount, ...] = (3,)
-    particles: tuple[Positive, ...] = (100,)
-    oracles: tuple[Oracle, ...] = ("none",)
     preset: NoisePreset = "standard"
-    comm_loss: float | None = None
+    options: Mapping[str, Any] = {}  # Further options of the environment
     duration: float | None = None  # Simulated time of an episode [s]; None: that of the plan
-    policies: tuple[str, ...] | None = None  # None: those of the run
+
+    def check(self) -> None:
+        """Refuse parts that are longer than the track."""
+        for name in ("base", "relaxed"):
+            if getattr(self, name) > self.seeds:
+                raise argument_error(name, f"at most {self.seeds} seeds", getattr(self, name), "Correct the track.")
+
+
+class Relaxation(Checked):
+    """What an episode is without one of its limits."""
+
+    title: str
+    oracle: Literal["none", "pose", "association", "merge", "all"] = "none"  # Ground truth given to the robots
+    times: float = 1.0  # Factor of the simulated time
+    options: Mapping[str, Any] = {}  # Further options of the environment
 
 
 class Plan(Checked):
@@ -61,22 +76,27 @@ class Plan(Checked):
 
     name: str
     split: Literal["train", "validation", "test"]
+    first_seed: NonNegative = 0
     duration: float  # Simulated time of an episode [s]
     policies: tuple[str, ...]  # Policies of a run that names none; the others are compared with the first
-    parts: Mapping[str, Any]
+    relaxed_policy: str | None = None  # Policy that plays with limits relaxed
+    tracks: Mapping[str, Any]
+    relaxations: Mapping[str, Any] = {}
     floor_plans: Mapping[str, str] = {}  # SHA-256 of each floor plan, by file name
+    tasks: Mapping[str, str] = {}  # Digests of the tasks of the episodes of a track, world and team, in order of seeds
 
     def check(self) -> None:
-        """Refuse parts that are incomplete or name unknown worlds."""
+        """Refuse tracks that are incomplete or name unknown worlds, and options that no environment has."""
         from vslam_env.world.registry import check_source
 
-        for part in self.all_parts().values():
-            for world in part.worlds:
+        for name, track in self.all_tracks.items():
+            for world in track.worlds:
                 if world != FLOOR_PLANS:
                     check_source(world)
-                elif part.seeds > len(self.floor_plans):
-                    hint = "Name as many floor plans as the part has seeds."
-                    raise argument_error("floor_plans", f"at least {part.seeds}", len(self.floor_plans), hint)
+                elif not self.floor_plans:
+                    raise argument_error("floor_plans", "names and digests", "none", f"The track {name!r} needs them.")
+        for trial in self._first_trials():
+            self.environment(trial)
 
     @classmethod
     def load(cls, source: str) -> Self:
@@ -105,17 +125,24 @@ class Plan(Checked):
             ValueError: As in `load`; also if the plan has another hash than in the run. The message names `argument`.
         """
         copy = folder / PLAN_COPY
-        plan = cls.load(str(copy) if copy.is_file() else values["plan"])
-        if plan.digest != values["plan_hash"]:
+        plan = cls.load(str(copy) if copy.is_file() else str(values["plan"]))
+        if plan.digest != values.get("plan_hash"):
             hint = "Use the release that wrote it."
-            raise argument_error(argument, f"results of plan {plan.digest}", values["plan_hash"], hint)
+            raise argument_error(argument, f"results of plan {plan.digest}", values.get("plan_hash"), hint)
         return plan
 
-    def all_parts(self) -> dict[str, PlanPart]:
-        """Return the parts by name."""
-        return {name: PlanPart(**values) for name, values in self.parts.items()}
+    @cached_property
+    def all_tracks(self) -> dict[str, Track]:
+        """The tracks by name."""
+        return {name: Track(**values) for name, values in self.tracks.items()}
 
-    @property
+    @cached_property
+    def all_relaxations(self) -> dict[str, Relaxation]:
+        """The relaxations by name, the first one that of no limit."""
+        none = Relaxation(title="no limit relaxed")
+        return {NO_RELAXATION: none} | {name: Relaxation(**values) for name, values in self.relaxations.items()}
+
+    @cached_property
     def digest(self) -> str:
         """First 16 hexadecimal digits of SHA-256 over what is played.
 
@@ -123,43 +150,81 @@ class Plan(Checked):
         """
         return hashlib.sha256(repr(_sorted(self.model_dump(exclude={"policies"}))).encode()).hexdigest()[:16]
 
-    def trials(self, policies: tuple[str, ...] | None = None, quick: bool = False) -> list[PlanTrial]:
-        """Return all episodes, part by part, ordered by seed; those on floor plans that are missing are left out.
+    def trials(
+        self, policies: Sequence[str] | None = None, tracks: Sequence[str] | None = None, extent: str = ALL,
+        with_missing: bool = False,
+    ) -> list[PlanTrial]:  # fmt: skip
+        """Return all episodes: the base parts of the tracks, the rest of them, and those with limits relaxed.
 
         Args:
-            policies: Labels of the policies; None: those of the plan. Parts with policies of their own are played by
-                those of these that are chosen.
-            quick: Whether only the first seeds of the base part are played, without floor plans.
+            policies: Labels of the policies; None: those of the plan.
+            tracks: Names of the tracks; None: all.
+            extent: `ALL`, `BASE` for the base parts alone, or `QUICK` for the first seeds without floor plans.
+            with_missing: Whether episodes on floor plans that are missing here are among them.
+
+        Raises:
+            ValueError: If there is no such track.
         """
-        parts = self.all_parts()
-        if quick:
-            base, worlds = parts[BASE_PART], PlanPart.model_fields["worlds"].default
-            parts = {BASE_PART: base.replace(seeds=min(QUICK_SEEDS, base.seeds), worlds=worlds)}
+        hint = "Correct the name."
+        names = [check_choice("tracks", name, tuple(self.all_tracks), hint) for name in tracks or self.all_tracks]
+        players = self.policies if policies is None else policies
+        if extent == QUICK:
+            few = {name: range(min(QUICK_SEEDS, self.all_tracks[name].seeds)) for name in names}
+            return [trial for name in names for trial in self._of_track(name, players, few[name])]
+        found = [trial for name in names for trial in self._of_track(name, players, range(self.all_tracks[name].base))]
+        if extent == BASE:
+            return found
+        plans = range(len(self.floor_plans) if with_missing or not self.missing_floor_plans() else 0)
+        for name in names:
+            track = self.all_tracks[name]
+            found += self._of_track(name, players, range(track.base, track.seeds), plans)
+        if self.relaxed_policy is not None and self.relaxed_policy in players:
+            for name, relaxation in product(names, [*self.all_relaxations][1:]):
+                seeds = range(self.all_tracks[name].relaxed)
+                found += self._of_track(name, [self.relaxed_policy], seeds, relaxation=relaxation)
+        return found
+
+    def _of_track(
+        self, name: str, policies: Iterable[str], seeds: range, plans: range = range(0),
+        relaxation: str = NO_RELAXATION,
+    ) -> list[PlanTrial]:  # fmt: skip
+        """Return episodes of a track, ordered by seed: some seeds of each world, and some floor plans if it has any."""
+        track, files = self.all_tracks[name], list(self.floor_plans)
+        places = [(k, world, world) for k, world in product(seeds, track.worlds) if world != FLOOR_PLANS]
+        places += [(k, FLOOR_PLANS, files[k]) for k in plans if FLOOR_PLANS in track.worlds]
         return [
             PlanTrial(
-                part=name, policy=policy, family=family, robots=robots, particles=particles, oracle=oracle, seed=seed,
-                world=list(self.floor_plans)[seed] if family == FLOOR_PLANS else family, preset=part.preset,
-                comm_loss=part.comm_loss, duration=part.duration or self.duration,
+                track=name, policy=policy, family=family, world=world, robots=robots, relaxation=relaxation,
+                seed=self.first_seed + k,
             )
-            for name, part in parts.items()
-            for seed, family, robots, particles, oracle, policy in product(
-                range(part.seeds), part.worlds, part.robots, part.particles, part.oracles, self._players(part, policies)
-            )
-            if family != FLOOR_PLANS or not self.missing_floor_plans()
+            for (k, family, world), robots, policy in product(places, track.robots, policies)
         ]  # fmt: skip
 
-    def _players(self, part: PlanPart, chosen: tuple[str, ...] | None) -> tuple[str, ...]:
-        """Return the policies that play a part."""
-        if part.policies is None or chosen is None:
-            return part.policies or chosen or self.policies
-        return tuple(policy for policy in chosen if policy in part.policies)
+    def _first_trials(self) -> list[PlanTrial]:
+        """Return an episode of each track and relaxation."""
+        return [
+            PlanTrial(
+                track=name, policy="frontier", family=world, world=world, robots=track.robots[0], relaxation=relaxation,
+                seed=self.first_seed,
+            )
+            for name, track in self.all_tracks.items()
+            for world in [world for world in track.worlds if world != FLOOR_PLANS][:1]
+            for relaxation in self.all_relaxations
+        ]  # fmt: skip
 
     def missing_floor_plans(self) -> list[str]:
         """Return the names of floor plans that `VSLAM_DATA` does not contain."""
         return [name for name, digest in self.floor_plans.items() if _find_floor_plan(name, digest, _data()) is None]
 
+    def task_of(self, trial: PlanTrial) -> str | None:
+        """Return the digest that the task of an episode must have, None where the plan has none."""
+        words = self.tasks.get(task_name(trial), "").split()
+        k = trial.seed - self.first_seed
+        return words[k] if trial.relaxation == NO_RELAXATION and k < len(words) else None
+
     def environment(self, trial: PlanTrial) -> "EnvConfig":
         """Return the environment of an episode; all policies of a seed have the same world."""
+        track, relaxation = self.all_tracks[trial.track], self.all_relaxations[trial.relaxation]
         world = trial.world
         if trial.family == FLOOR_PLANS:
             found = _find_floor_plan(world, self.floor_plans[world], _data())
@@ -167,9 +232,10 @@ class Plan(Checked):
                 raise argument_error("VSLAM_DATA", f"a folder with {world!r}", _data(), "Set it to the data folder.")
             world = str(found)
         config = environment_of(
-            trial, world, self.split, trial.duration, particles=trial.particles, preset=trial.preset
-        )
-        return config if trial.comm_loss is None else config.replace(comm_loss=trial.comm_loss)
+            trial.policy, relaxation.oracle, world, self.split, robots=trial.robots, preset=track.preset,
+            max_seconds=relaxation.times * (track.duration or self.duration),
+        )  # fmt: skip
+        return config.replace(**track.options).replace(**relaxation.options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +248,11 @@ class PlanBench:
     def environment(self, trial: PlanTrial) -> "EnvConfig":
         """Return the environment of an episode."""
         return self.plan.environment(trial)
+
+
+def task_name(trial: PlanTrial) -> str:
+    """Return the name under which a plan has the digests of a trial's track, world and number of robots."""
+    return f"{trial.track}, {trial.family}, {trial.robots}"
 
 
 def _sorted(value: Any) -> Any:

@@ -47,12 +47,14 @@ class Player(NamedTuple):
         """Keys of the observations of its environment."""
         return keys_for(make_policy(self.policy, self.action_type), self.action_type)
 
+    def source_file(self) -> Path | None:
+        """Return the file of a custom policy or a model; None for planners."""
+        return plugin_file(self.policy) if is_plugin(self.policy) else model_file(self.policy)
+
     def source_digest(self) -> str:
         """Return 16 hexadecimal digits of SHA-256 over a custom policy's file or a model; empty for planners."""
-        file = plugin_file(self.policy) if is_plugin(self.policy) else model_file(self.policy)
-        if file is None:
-            return ""
-        return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        file = self.source_file()
+        return "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()[:16]
 
     @property
     def needs_oracles(self) -> bool:
@@ -74,23 +76,22 @@ class Player(NamedTuple):
         return GuardedTeam(policies, self.label, self.action_type, limit)
 
 
-def environment_of(trial: Any, world: str, split: str, duration: float, **run: Any) -> EnvConfig:
+def environment_of(policy: str, oracle: str, world: str, split: str, **run: Any) -> EnvConfig:
     """Return the environment of an episode of a policy.
 
     Args:
-        trial: Trial with `policy`, `robots`, `oracle` and `seed`.
+        policy: Label of the policy.
+        oracle: Ground truth given to the robots: `NO_ORACLE`, `ALL_ORACLES` or one of `ORACLES`.
         world: World family or path.
         split: Split of worlds, or `ANY_SPLIT`.
-        duration: Simulated time [s].
         run: More fields of `RunConfig`.
     """
-    player = parted(trial.policy)
+    player = parted(policy)
     config = RunConfig(
-        world=world, robots=trial.robots, policy=player.policy, action_type=player.action_type,  # type: ignore[arg-type]
-        seed=trial.seed, max_seconds=duration, **run,
+        world=world, policy=player.policy, action_type=player.action_type, **run,  # type: ignore[arg-type]
     ).environment()  # fmt: skip
-    has_all = trial.oracle == ALL_ORACLES or player.needs_oracles
-    oracles = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}
+    has_all = oracle == ALL_ORACLES or player.needs_oracles
+    oracles = {f"oracle_{name}": has_all or oracle == name for name in ORACLES}
     return config.replace(world_split=world_split(split, world), **oracles)
 
 

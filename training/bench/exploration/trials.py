@@ -1,11 +1,13 @@
 """Trial of `vslam bench exploration`: an episode, and its metrics for the comparison of policies."""
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,10 +26,13 @@ from training.episodes.runner import EpisodeRecord, MergeRecord, run_episode
 from training.experiments.trial_store import FAILED, TRIALS_FILE
 from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
+from vslam_env.environment import ExplorationEnv
 
 HALF, NEARLY_ALL = 0.5, 0.9  # shares of the floor
 WATCHED_S = 20.0  # a wrong merge that persists for this long, or to the end, is false
 CURVE_POINTS = 25
+ROUNDED = 1e-4  # m, rad, and units of what else counts in a task
+DIGEST = 8  # hexadecimal digits of the digest of a task
 TEAM = ("map_error", "map_rmse_m", "map_recall", "map_precision", "ate_start_m", "ate_aligned_m")
 CURVES = ("coverage", "map_error", "pose_error")
 
@@ -59,18 +64,19 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
     - `decision_ms`, `decision_p99_ms`: median and 99th percentile of the processor time of a decision of the policy, of
       a team policy for all robots.
     - `curves`: `time_s` and the values of `CURVES` at these times.
-    - `digest`: see `episode_digest`; `policy_digest`: that of a custom policy's file or a model; `machine`: what last
-      bits depend on.
+    - `task`: see `task_digest`; `digest`: see `episode_digest`; `policy_digest`: that of a custom policy's file or a
+      model; `version` of this package; `machine`: what last bits depend on.
 
     If the policy fails, the trial is returned with the error as `failed`, and no metrics.
     """
     player = parted(trial.policy)
     env = vslam_v1.parallel_env(config=config.environment(trial), observation_keys=player.observation_keys)
     team = player.make(env, config.decision_limit)
-    invalid = 0
+    invalid, task = 0, ""
 
     def count(progress: Any) -> None:
-        nonlocal invalid
+        nonlocal invalid, task
+        task = task or task_digest(env)
         invalid += sum(info["invalid_action"] for info in progress.infos.values())
 
     try:
@@ -104,8 +110,26 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
         "curves": {"time_s": points} | {
             name: values_at(record.times, line, points) for name, line in zip(CURVES, lines, strict=True)
         },
-        "digest": episode_digest(record), "policy_digest": player.source_digest(), "machine": machine(),
+        "action_type": player.action_type, "task": task, "digest": episode_digest(record),
+        "policy_digest": player.source_digest(), "version": version("vslam-env"),
+        "machine": machine(),
     }  # fmt: skip
+
+
+def task_digest(env: ExplorationEnv) -> str:
+    """Return eight hexadecimal digits of SHA-256 over what an episode is before its first step.
+
+    That is walls, scored landmarks, starts, biases of the odometry, the seed of the filters, and the first readings;
+    numbers are rounded, so that last bits do not matter. Policies, actions and the estimator do not count.
+    """
+    scenario, landmarks = env.episode.scenario, env.episode.scenario.world.landmarks
+    assert landmarks is not None
+    readings = [part for robot in env.readings for part in (robot.scan, robot.measurements.points)]
+    place = scenario.world.walls, landmarks.positions, landmarks.descriptors, scenario.true_starts, scenario.bias
+    content = hashlib.sha256(repr((scenario.belief_seed, scenario.observable_landmarks.tolist())).encode())
+    for part in (*place, *readings):
+        content.update(np.rint(np.asarray(part, np.float64) / ROUNDED).astype(np.int64).tobytes())
+    return content.hexdigest()[:DIGEST]
 
 
 def first_steps(environment: EnvConfig, player: Player, seed: int, decision_limit: float) -> None:

@@ -5,13 +5,15 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slam_backend.core.files import append_text
-from slam_backend.core.text_files import read_text
+from slam_backend.core.validation import argument_error
+from training.bench.exploration.episodes import bounded_bytes
 from training.bench.exploration.players import label
 from training.experiments.statistics import grouped
 from training.experiments.study import Column, ResultTable
@@ -21,14 +23,17 @@ Rows = Sequence[Mapping[str, Any]]
 OUTCOMES = ("all bits equal", "all numbers equal", "different")
 CLOSE = 1e-4  # relative difference up to which numbers count as equal where last bits may differ
 CLOSE_TO_ZERO = 1e-7  # absolute one
-NOT_COMPARED = ("digest", "policy_digest", "machine", "decision_ms", "decision_p99_ms", "curves")
+NOT_COMPARED = ("digest", "policy_digest", "version", "machine", "decision_ms", "decision_p99_ms", "curves")
+COMMAND = "vslam bench exploration --verify"  # the only one whose comparisons count
+TENTH = 0.1  # share of the episodes that are played again, and that must be for a row to count as replayed
 
 
-def choose(rows: Rows, count: int, rng: np.random.Generator) -> list[Mapping[str, Any]]:
-    """Return up to `count` random rows of each policy."""
+def choose(rows: Rows, count: int | None, rng: np.random.Generator) -> list[Mapping[str, Any]]:
+    """Return random rows of each policy, up to a number of them; None: a tenth."""
     chosen: list[Mapping[str, Any]] = []
     for group in grouped(rows, ("policy",)).values():
-        chosen += [group[i] for i in sorted(rng.choice(len(group), min(count, len(group)), replace=False))]
+        wanted = math.ceil(TENTH * len(group)) if count is None else count
+        chosen += [group[i] for i in sorted(rng.choice(len(group), min(wanted, len(group)), replace=False))]
     return chosen
 
 
@@ -50,9 +55,9 @@ def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, An
 
 
 def keep(folder: Path, comparison: Mapping[str, Any], trial: Mapping[str, Any]) -> None:
-    """Append a comparison, with its trial and the date, to the run folder."""
-    line = {"date": datetime.date.today().isoformat(), **trial, **comparison}
-    append_text(folder / VERIFIED_FILE, json.dumps(line) + "\n", "verify")
+    """Append a comparison, with its trial, the date and the command, to the run folder."""
+    about = {"date": datetime.date.today().isoformat(), "by": f"{COMMAND} {version('vslam-env')}"}
+    append_text(folder / VERIFIED_FILE, json.dumps({**about, **trial, **comparison}) + "\n", "verify")
 
 
 def outcome_counts(comparisons: Rows) -> list[int]:
@@ -61,17 +66,41 @@ def outcome_counts(comparisons: Rows) -> list[int]:
     return [outcomes.count(outcome) for outcome in OUTCOMES]
 
 
-def last_outcomes(folder: Path) -> dict[str, list[int]]:
-    """Return the `outcome_counts` of each policy's last verification date in a run folder, an episode once."""
+def replayed(folder: Path, rows: Rows) -> dict[str, list[int]]:
+    """Return the `outcome_counts` of each policy of a run folder, each of its episodes once, by its last comparison.
+
+    A comparison counts if `COMMAND` made it, of an episode with the policy and the digest that a row has.
+
+    Raises:
+        ValueError: If the file is too large, or a line is none that the command writes; the text names it.
+    """
     file = folder / VERIFIED_FILE
-    text = read_text(file, "folders", "a file of comparisons") if file.is_file() else ""
-    lines = [json.loads(line) for line in text.splitlines()]
-    counts: dict[str, list[int]] = {}
-    for (policy,), group in grouped(lines, ("policy",)).items():
-        last = max(line["date"] for line in group)
-        of_last = {row["digest"]: row for row in group if row["date"] == last}
-        counts[policy] = outcome_counts(list(of_last.values()))
-    return counts
+    lines = bounded_bytes(file, "folders").decode(errors="replace").splitlines() if file.is_file() else []
+    known = {(row["policy"], row["digest"]) for row in rows}
+    last: dict[tuple[str, str], Mapping[str, Any]] = {}
+    for count, text in enumerate(lines, start=1):
+        line = _comparison(text)
+        if line is None:
+            hint = f"Remove line {count} of {str(file)!r}, and play its episode again."
+            raise argument_error("folders", "a comparison in each line", f"a damaged line {count}", hint)
+        episode = line["policy"], line["digest"]
+        if episode in known and line["by"].startswith(COMMAND):
+            last[episode] = line
+    return {policy: outcome_counts(group) for (policy,), group in grouped(last.values(), ("policy",)).items()}
+
+
+def _comparison(text: str) -> Mapping[str, Any] | None:
+    """Return the comparison in a line, None if there is none."""
+    try:
+        line = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(line, dict) or not all(
+        isinstance(line.get(name), str) for name in ("by", "policy", "digest", "date")
+    ):
+        return None
+    is_sound = type(line.get("is_close")) is bool and type(line.get("is_equal", "")) in (bool, type(None))
+    return line if is_sound else None
 
 
 def _outcome(comparison: Mapping[str, Any]) -> int:
