@@ -52,6 +52,9 @@ BAD: dict[str, dict[str, str]] = {
         "none.npz --policies random_walk": "action_type: expected 'continuous' or 'discrete' for policy",
         "none.npz --workers 0": "workers: expected an int >= 1, got 0.",
     },
+    "bench submit": {
+        "nowhere": "folders: expected the config.toml of an earlier run, got no such file.",
+    },
     "bench leaderboard": {
         "none": "folders: expected the config.toml of an earlier run, got no such file. Check 'none'.",
         "full": "folders: expected the config.toml of an earlier run, got no such file. Check 'full",

@@ -81,7 +81,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "landmarks": {(9,): "an int >= 10"},
     },
     exploration.PlanConfig: {
-        "decision_limit": {0.0: ABOVE_0}, "quick": {1: "a bool"}, "plan": {3: "a text"},
+        "decision_limit": {0.0: ABOVE_0}, "extent": {"half": "one of 'all', 'base', 'quick'"}, "plan": {3: "a text"},
         "policies": {("frontier", "frontier"): "at least one value, each once"},
     },
     speed.BatchedSpeedConfig: {"rows": {3: "an int >= 16"}, "beside": {-1: AT_LEAST_0}, "batches": {(0,): AT_LEAST_1}},
