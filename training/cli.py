@@ -45,6 +45,8 @@ COMMANDS = {
         "Write report.html into a run folder: playback of the episode, curves and tables, in one file for any browser.",
     ),
     "compare": ("report", "compare", "Compare two run folders: options that differ, and metrics side by side."),
+    "score": ("score", "score", "Score paths and a map of one robot or a team against the truth, under one alignment."),
+    "merge": ("merge", "merge", "Align two landmark maps from files and merge them, or say why not."),
     "warm-up": (
         "warm_up", "warm_up", "Compile the kernels into the disk cache; takes seconds if they are cached already.",
     ),

@@ -12,13 +12,16 @@ from slam_backend.metrics.maps import (
     ospa,
 )
 from slam_backend.metrics.paths import AteResult, RpeResult, align_se2, ate, rpe
+from slam_backend.metrics.teams import RobotScore, TeamScore, match_times, score_team
 
 __all__ = [
     "AteResult",
     "GospaResult",
     "MapErrorParts",
     "MapScore",
+    "RobotScore",
     "RpeResult",
+    "TeamScore",
     "align_se2",
     "anees",
     "ate",
@@ -26,8 +29,10 @@ __all__ = [
     "map_error",
     "map_error_parts",
     "map_rmse",
+    "match_times",
     "nees",
     "nis",
     "ospa",
     "rpe",
+    "score_team",
 ]

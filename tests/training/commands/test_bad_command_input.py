@@ -105,6 +105,10 @@ BAD: dict[str, dict[str, str]] = {
     "paper fig5": {"--max-seconds 0": "max_seconds: expected an int >= 1, got 0."},
     "paper fig6": {"--robots 16": "measurements: expected an int >= 16, got 15.", "--robots a": f"robots: {LIST} 'a'."},
     "report": {"nowhere": "folder: expected the folder of a run, with config.toml, got no such folder."},
+    "score": {
+        "--truth none.txt --estimate none.txt": "path: expected a TUM trajectory file, got 'none.txt'.",
+    },
+    "merge": {"none.npz none.npz": "path: expected a file written by LandmarkMap.save, got no such file."},
     "compare": {"nowhere elsewhere": "folder: expected the folder of a run, with config.toml, got no such folder."},
     "worlds validate": {
         "castle": "world: expected one of 'office'",

@@ -69,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_all_commands_with_json_are_covered() -> None:
     """The table has each command with the option but those that are tested elsewhere."""
-    elsewhere = {"compare", "replay MODULE:FUNCTION", "train-batched", "bench speed batched"}
+    elsewhere = {"compare", "score", "merge", "replay MODULE:FUNCTION", "train-batched", "bench speed batched"}
     assert set(_commands(typer.main.get_command(cli.app))) == set(LEAST) | elsewhere
 
 
