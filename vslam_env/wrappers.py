@@ -10,8 +10,8 @@ from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 from slam_backend.core.validation import Float32Array, argument_error
 from vslam_env.belief.observation import GRIDS, flatten, observation_space
-from vslam_env.belief.observation_keys import MASK, in_order_of_one, key_spaces
-from vslam_env.environment import ExplorationEnv
+from vslam_env.belief.observation_keys import MASK, SCALES, in_order_of_one, key_spaces
+from vslam_env.environment import STATE_PER_ROBOT, STATE_POSITIONS, ExplorationEnv
 
 VECTOR, WHOLE, IMAGE = "observation", "observations", "image"
 BLOCK = 4  # cells of a grid along a side that become one
@@ -51,7 +51,8 @@ class Scaled(_Wrapper):
 
     Metres, radians, seconds and numbers are multiplied by `observation_keys.SCALES`; grids become shares from 0 to 1
     in blocks of 4 x 4 cells, so that (3, 48, 48) uint8 become (3, 12, 12). Flat observations stay vectors, of less
-    than a tenth of the length. The mask of `goal` actions, images and `state()` stay as they are.
+    than a tenth of the length. Metres in `state()` are multiplied as well. The mask of `goal` actions and images stay
+    as they are.
 
     Args:
         env: Environment with dict or flat observations.
@@ -63,6 +64,14 @@ class Scaled(_Wrapper):
         boxes = key_spaces(scan.num_rays, scan.max_range)
         self._shapes = {name: boxes[name].shape for name in config.observed if name != MASK}
         super().__init__(env)
+
+    def state(self) -> NDArray[np.float32]:
+        """Return the true state for centralised critics; see `ExplorationEnv.state`."""
+        state: NDArray[np.float32] = self.env.state()
+        robots = state[: STATE_PER_ROBOT * self._config.num_robots].reshape(-1, STATE_PER_ROBOT)
+        for first in STATE_POSITIONS:
+            robots[:, first : first + 2] *= np.float32(SCALES["pose"][0])
+        return state
 
     def _space(self, space: Any) -> spaces.Space[Any]:
         if isinstance(space, spaces.Box):

@@ -1,12 +1,14 @@
-"""Curves of plain PPO in halls beside policies that need no training: what a first training looks like.
+"""Curves of learners in halls beside policies that need no training: what a first training looks like.
 
 python -m studies.learning.first_curve --robots 1,3
+python -m studies.learning.first_curve --robots 1,3 --learners ippo,mappo     # where BenchMARL is installed
 """
 
-from collections.abc import Callable
+import importlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,12 +23,16 @@ from vslam_env.wrappers import Scaled
 
 PPO, SCRIPTED = "ppo", ("random_goals", "frontier")
 POINTS = 15  # of a curve
+Choose = Callable[[Mapping[str, Any], bool], int]  # of a scaled observation; whether the most probable action is asked
 
 
 class Config(ExperimentConfig):
     """Trainings of several seeds, and scripted policies in as many worlds."""
 
     robots: tuple[RobotCount, ...] = option((1, 3), "Numbers of robots.", hint="Use 1 to 8 robots.")
+    learners: tuple[Literal["ppo", "ippo", "mappo"], ...] = option(
+        (PPO,), "Learners: ppo of Stable-Baselines3, ippo and mappo of BenchMARL."
+    )
     decisions: int = option(60_000, "Decisions of a training by each robot.", ge=800, hint="Use at least an update.")
     seeds: int = option(3, "Number of trainings.", ge=1, hint="Use one or more.")
     seed: int = first_seed()
@@ -38,7 +44,7 @@ class Trial:
     """One training, or the episodes of a scripted policy."""
 
     robots: int  # K
-    policy: str  # `PPO`, or one of `SCRIPTED`
+    policy: str  # A learner, or one of `SCRIPTED`
     seed: int
 
 
@@ -48,8 +54,8 @@ def trials(config: Config) -> list[Trial]:
     return [
         Trial(robots=robots, policy=policy, seed=seed)
         for robots in config.robots
-        for policy in (*SCRIPTED, PPO)
-        for seed in (seeds if policy == PPO else seeds[:1])
+        for policy in (*SCRIPTED, *config.learners)
+        for seed in (seeds[:1] if policy in SCRIPTED else seeds)
     ]
 
 
@@ -61,14 +67,14 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
         policies; `sampled` and `greedy`: mean return in validation worlds [m] of sampled actions and of the most
         probable ones.
     """
-    if trial.policy != PPO:
+    if trial.policy in SCRIPTED:
         level = mean_return(trial.robots, config.episodes, partial(_scripted, trial.policy))
         curve = {"time_s": [0.0, config.decisions / 1000], "return_m": [level, level]}
         return {"curves": curve, "sampled": level, "greedy": level}
-    model, points = train(trial.robots, config.decisions * trial.robots, trial.seed)
+    choose, points = _trained(trial.policy, trial.robots, config.decisions * trial.robots, trial.seed)
     parts = np.array_split(np.array(points), min(POINTS, len(points)))
     sampled, greedy = (
-        mean_return(trial.robots, config.episodes, partial(_Model, model, is_greedy)) for is_greedy in (False, True)
+        mean_return(trial.robots, config.episodes, partial(_Model, choose, is_greedy)) for is_greedy in (False, True)
     )
     curve = {
         "time_s": [float(part[-1, 0]) / trial.robots / 1000 for part in parts],
@@ -77,18 +83,29 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     return {"curves": curve, "sampled": sampled, "greedy": greedy}
 
 
-class _Model:
-    """Policy of a model of Stable-Baselines3."""
+def _trained(learner: str, robots: int, decisions: int, seed: int) -> tuple[Choose, list[tuple[int, float]]]:
+    """Train one network for all robots."""
+    if learner != PPO:  # imported by its name: BenchMARL lives in an environment of its own
+        trained: tuple[Choose, list[tuple[int, float]]] = importlib.import_module(
+            "studies.learning.benchmarl_task"
+        ).train(learner, robots, decisions, seed)
+        return trained
+    model, points = train(robots, decisions, seed)
+    return lambda seen, is_greedy: int(model.predict(seen, deterministic=is_greedy)[0]), points
 
-    def __init__(self, model: Any, is_greedy: bool) -> None:
-        self._model, self._is_greedy = model, is_greedy
+
+class _Model:
+    """Policy of a trained network."""
+
+    def __init__(self, choose: Choose, is_greedy: bool) -> None:
+        self._choose, self._is_greedy = choose, is_greedy
 
     def reset(self) -> None:
         """Keep nothing of the last episode."""
 
     def act(self, observation: Any, belief: Any, rng: np.random.Generator) -> int:
         """Return the action for a scaled observation."""
-        return int(self._model.predict(observation, deterministic=self._is_greedy)[0])
+        return self._choose(observation, self._is_greedy)
 
 
 def _scripted(name: str) -> Policy:
@@ -113,7 +130,13 @@ def mean_return(robots: int, episodes: int, make: Callable[[], Policy]) -> float
     return float(np.mean(returns))
 
 
-NAMES = {PPO: "PPO", "random_goals": "random valid goals", "frontier": "nearest frontier"}
+NAMES = {
+    PPO: "PPO",
+    "ippo": "IPPO",
+    "mappo": "MAPPO",
+    "random_goals": "random valid goals",
+    "frontier": "nearest frontier",
+}
 WORDS = {
     "robots": ("robots", lambda robots: "one robot" if robots == 1 else f"{robots} robots"),
     "policy": ("policy", NAMES.__getitem__),
@@ -123,7 +146,7 @@ COLUMNS = (
     Column("greedy", "most probable action [m]", interval=True),
 )
 STUDY = Study(
-    name="first_curve", about="Draw the curves of plain PPO in halls.", config=Config, trial=Trial, trials=trials,
+    name="first_curve", about="Draw the curves of learners in halls.", config=Config, trial=Trial, trials=trials,
     play=play,
     tables=(
         ResultTable(

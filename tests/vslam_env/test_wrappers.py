@@ -134,14 +134,18 @@ def _valid(env: Any, agent: str, seen: Any, rng: np.random.Generator) -> Any:
 
 
 def test_scaled_environments_pass_the_checkers() -> None:
-    """PettingZoo's suite and Gymnasium's checker pass; snapshots, `state` and beliefs are those of the environment."""
+    """PettingZoo's suite and Gymnasium's checker pass, beliefs are those of the environment, and `state` is scaled."""
     from gymnasium.utils.env_checker import check_env
     from pettingzoo.test import parallel_api_test
 
     env = Scaled(_env("flat", action_type="discrete"))
     parallel_api_test(env, num_cycles=6)
     env.reset(seed=0)
-    np.testing.assert_array_equal(env.state(), env.unwrapped.state())
+    bare, scaled = (state[:-2].reshape(2, -1) for state in (env.unwrapped.state(), env.state()))
+    metres = [0, 1, 4, 5]  # true and estimated positions
+    np.testing.assert_allclose(scaled[:, metres], 0.1 * bare[:, metres], rtol=1e-6)
+    np.testing.assert_array_equal(np.delete(scaled, metres, 1), np.delete(bare, metres, 1))
+    np.testing.assert_array_equal(env.state()[-2:], env.unwrapped.state()[-2:])
     assert env.belief("robot_0").robot == 0
     solo = gymnasium.make(
         "vslam_env/SoloExploration-v1", wrap=Scaled, world=room(), num_particles=10, max_cycles=3,
