@@ -129,7 +129,7 @@ def escaped(text: str) -> str:
     >>> escaped("<b>a|b</b>")
     '&lt;b&gt;a&#124;b&lt;/b&gt;'
     """
-    marks = {ord(mark): f"&#{ord(mark)};" for mark in "|`[]*_\\"}
+    marks = {ord(mark): f"&#{ord(mark)};" for mark in "|`[]*\\"}
     return html.escape(" ".join(text.split()), quote=False).translate(marks)
 
 

@@ -35,6 +35,8 @@ def tables(plan: Plan, rows: Rows) -> list[ResultTable]:
     first = next((name for name in plan.policies if _of(played, policy=name)), None)
     other = _of(played, policy=first)
     base = [name for name, track in plan.all_tracks.items() if track.base]
+    played_by = {name: {row["policy"] for row in _of(played, track=name) if _is_base(plan, row)} for name in base}
+    whole = set.intersection(*played_by.values()) if base else set()  # policies with a mean over all of them
     title = " and ".join(base)
     compared = f" Differences to `{shown(first)}` are paired." if first is not None else ""
     note = f"Means over the worlds of the base part, each family and track alike, with 95 % intervals.{compared}"
@@ -50,13 +52,13 @@ def tables(plan: Plan, rows: Rows) -> list[ResultTable]:
     return [
         ResultTable(
             name="headline", title=f"Mean of {title}", note=note, by=("policy",), columns=headline, words=words,
-            where=partial(_is_base, plan),
+            where=partial(_counts, plan, whole, None),
         ),
         *(
             ResultTable(
                 name=name, title=f"Track {name}: {actions} actions only, mean of {title}", by=("policy",),
                 columns=headline, words=words,
-                where=partial(_has_actions, plan, actions),
+                where=partial(_counts, plan, whole, actions),
             )
             for name, actions in ACTION_TRACKS.items()
         ),
@@ -220,9 +222,9 @@ def _is_base(plan: Plan, row: Mapping[str, Any]) -> bool:
     return row["relaxation"] == NO_RELAXATION and row["family"] != FLOOR_PLANS and bool(is_early)
 
 
-def _has_actions(plan: Plan, actions: str, row: Mapping[str, Any]) -> bool:
-    """Return whether an episode of the base part was played with one kind of actions."""
-    return row["action_type"] == actions and _is_base(plan, row)
+def _counts(plan: Plan, policies: set[str], actions: str | None, row: Mapping[str, Any]) -> bool:
+    """Return whether an episode of the base part is one of some policies, and of one kind of actions if it is given."""
+    return row["policy"] in policies and actions in (None, row["action_type"]) and _is_base(plan, row)
 
 
 def _of(rows: Rows, **where: Any) -> Rows:
