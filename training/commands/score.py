@@ -28,9 +28,9 @@ def score(
     landmarks: Annotated[
         Path | None, typer.Option(help="True landmarks: .csv with columns x, y, z.", show_default="none")
     ] = None,
-    max_gap: Annotated[float, typer.Option(help="Largest difference of the times of compared poses [s].")] = 0.01,
+    max_gap: Annotated[float, typer.Option(help="Largest difference of the times of compared poses \\[s].")] = 0.01,
     delta: Annotated[int, typer.Option(help="Poses over which the relative pose error is taken.")] = 1,
-    gate: Annotated[float, typer.Option(help="Largest distance of a landmark to its true one [m].")] = 0.5,
+    gate: Annotated[float, typer.Option(help="Largest distance of a landmark to its true one \\[m].")] = 0.5,
     json: Annotated[
         Path | None,
         typer.Option(
