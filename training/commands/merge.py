@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.commands._run_folder import claim_stdout, write_json
+from training.commands._options import Json
+from training.commands._run_folder import write_json
 from training.experiments.console import make_console
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
@@ -21,13 +22,7 @@ def merge(
     out: Annotated[Path, typer.Option(help="File of the merged map; a picture goes beside it.")] = Path("merged.npz"),
     min_inliers: Annotated[int, typer.Option(help="Fewest common landmarks.", min=3)] = 8,
     appearance: Annotated[bool, typer.Option(help="Whether descriptors decide which landmarks may be equal.")] = True,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            help="Also write the result to this file; - is stdout, with all other output on stderr.",
-            show_default=False, callback=claim_stdout,
-        ),
-    ] = None,
+    json: Json = None,
 ) -> None:  # fmt: skip
     """Align two landmark maps from files and merge them, or say why not.
 

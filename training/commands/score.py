@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.commands._options import words
-from training.commands._run_folder import claim_stdout, write_json
+from training.commands._options import Json, words
+from training.commands._run_folder import write_json
 from training.experiments.console import make_console
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
@@ -31,13 +31,7 @@ def score(
     max_gap: Annotated[float, typer.Option(help="Largest difference of the times of compared poses \\[s].")] = 0.01,
     delta: Annotated[int, typer.Option(help="Poses over which the relative pose error is taken.")] = 1,
     gate: Annotated[float, typer.Option(help="Largest distance of a landmark to its true one \\[m].")] = 0.5,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            help="Also write the metrics to this file; - is stdout, with all other output on stderr.",
-            show_default=False, callback=claim_stdout,
-        ),
-    ] = None,
+    json: Json = None,
 ) -> None:  # fmt: skip
     """Score paths and a map of one robot or a team against the truth, under one alignment.
 

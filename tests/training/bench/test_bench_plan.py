@@ -554,6 +554,7 @@ def test_rows_must_be_those_of_the_plan(forged: Any) -> None:
         (lambda rows: [{**rows[0], "seed": row["seed"], "policy": row["policy"]} for row in rows], "expected"),
         (lambda rows: [*rows[:2], {**rows[2], "digest": rows[0]["digest"]}, *rows[3:]], "expected each episode once"),
         (lambda rows: rows[2:], "expected complete results"),
+        (lambda rows: [], "expected results of a plan"),
         (with_last(seed=9), "expected episodes of the plan"),
         (with_last(world="maze"), "expected episodes of the plan"),
         (with_last(track="hard"), "expected episodes of the plan"),

@@ -49,7 +49,7 @@ def read_results(folder: Path) -> Results:
     """
     values, _ = read_config(folder, COMMAND, "folders")
     rows = kept_episodes(folder)
-    if rows is None or "plan" not in values:
+    if not rows or "plan" not in values:
         hint = "Run vslam bench exploration --plan."
         raise argument_error("folders", "results of a plan", f"none in {str(folder)!r}", hint)
     plan = Plan.of_run(folder, values, "folders")

@@ -131,8 +131,8 @@ def markdown(plan: Plan, rows: Rows, policies: Sequence[str]) -> str:
         policies: Labels of the policies that should have rows.
     """
     parts = [f"Plan {plan.name}, hash {plan.digest}. {E_SCALE}\n"]
-    if plan.floor_plans and plan.missing_floor_plans():
-        parts.append("There are no rows of floor plans: they need `VSLAM_DATA`.\n")
+    if plan.floor_plans and not _of(rows, family=FLOOR_PLANS):
+        parts.append("There are no rows of floor plans: they need `VSLAM_DATA`, and are no part of the base.\n")
     parts += [f"Not a complete result: {text}.\n" for text in incomplete(plan, rows, policies)]
     for table, title, headings, cells in sections(plan, rows):
         note = f"{table.note}\n\n" if table.note else ""
