@@ -5,7 +5,7 @@ from a definition, and only such as are words, so that no text of a bag becomes 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -88,7 +88,7 @@ class Bag:
             raise argument_error(argument, f"one type of messages of {name}", "a topic of several", "Record it alone.")
         return topic
 
-    def messages(self, argument: str, name: str) -> Iterator[Any]:
+    def messages(self, argument: str, name: str) -> Generator[Any, None, None]:
         """Yield the messages of a topic, in order of arrival.
 
         Args:

@@ -1,9 +1,10 @@
 """Reader of bags of ROS 1 and ROS 2 (extra `ros`): odometry, landmarks, true poses and a camera as steps of filters."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -516,7 +517,8 @@ def _read_camera(
     Its image is the part around the principal point, since a `StereoCamera` has this in the middle.
     """
     check_type("camera", topic, bag.check_topic("camera", topic).kind, CAMERAS)
-    message = next(_first(bag.messages("camera", topic)))
+    with closing(bag.messages("camera", topic)) as messages:
+        message = next(messages)
     projection = np.asarray(message.p if hasattr(message, "p") else message.P, np.float64)
     matrix = np.asarray(message.k if hasattr(message, "k") else message.K, np.float64)
     rectified = bool(projection[0] > 0.0)
@@ -544,8 +546,3 @@ def _read_camera(
         mount=tuple(mount.translation.tolist()),
     )  # fmt: skip
 
-
-def _first(messages: Iterator[Any]) -> Iterator[Any]:
-    """Yield the first message, and close the rest."""
-    yield next(messages)
-    messages.close()  # type: ignore[attr-defined]
