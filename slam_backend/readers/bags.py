@@ -1,10 +1,11 @@
 """Reader of bags of ROS 1 and ROS 2 (extra `ros`): odometry, landmarks, true poses and a camera as steps of filters."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,7 +205,7 @@ def _times(argument: str, topic: str, stamps: Sequence[int], notes: list[str]) -
     late = np.flatnonzero(steps_back(times) > MOST_JITTER)
     if len(late):
         row = int(late[0])
-        got = f"a stamp {times[row]:.3f} s after {times[:row].max():.3f} s in message {int(kept[row])}"
+        got = f"a stamp {times[row]:.3f} s after {times[:row].max():.3f} s"
         expected = f"stamps of {topic} that go back by at most {MOST_JITTER:g} s"
         raise argument_error(argument, expected, got, "Cut the bag there, or correct the clock.")
     order, words = time_order(topic, times)
@@ -467,11 +468,15 @@ def _identities(
             np.arange(len(each.times)) for each in seen
         ]  # fmt: skip
     every = {str(name) for each in seen for name in np.unique(np.asarray(each.names))}
-    numeric = all(name.lstrip("-").isdecimal() for name in every)
-    names = sorted(every, key=int if numeric else str)
+    names = sorted(every, key=_by_numbers)
     index = {name: column for column, name in enumerate(names)}
     columns = [np.array([index[str(name)] for name in np.asarray(each.names)], np.int64) for each in seen]
     return "identities", np.array(names), columns
+
+
+def _by_numbers(name: str) -> list[Any]:
+    """Return what sorts names by the numbers in them: a2 before a10."""
+    return [int(part) if number % 2 else part for number, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def _frames(
@@ -535,7 +540,7 @@ def _read_camera(
     if not np.array_equal(mount.rotation, np.eye(3)):  # optical axes
         squint = float(np.arccos(np.clip(mount.rotation[0, 2], -1.0, 1.0)))
         if squint > MOST_SQUINT:
-            expected = f"a camera that looks along x of {base!r}, to {MOST_SQUINT:g} rad,"
+            expected = f"a camera that looks along x of {base!r}, to {MOST_SQUINT:g} rad"
             got = f"a camera turned by {squint:.2f} rad"
             raise argument_error("camera", expected, got, "Omit --camera: landmarks with positions do not need it.")
     usual = StereoCamera()
