@@ -49,7 +49,7 @@ class Topic(NamedTuple):
     """Topic of a bag: its type, such as `nav_msgs/Odometry`, and its number of messages."""
 
     kind: str
-    count: int
+    messages: int
 
 
 @short_repr
@@ -79,11 +79,11 @@ class Bag:
         if (topic := self.topics.get(name)) is None:
             hint = f"{did_you_mean(name, self.topics)}The bag has {', '.join(self.topics) or 'no topic'}."
             raise argument_error(argument, "a topic of the bag", name, hint)
-        if not topic.count:
+        if not topic.messages:
             raise argument_error(argument, f"messages of {name}", "no message", "Record the topic while it is sent.")
-        if topic.count > MOST_MESSAGES:
+        if topic.messages > MOST_MESSAGES:
             hint = "Cut the bag into parts."
-            raise argument_error(argument, f"at most {MOST_MESSAGES:,} messages of {name}", topic.count, hint)
+            raise argument_error(argument, f"at most {MOST_MESSAGES:,} messages of {name}", topic.messages, hint)
         if not topic.kind:
             raise argument_error(argument, f"one type of messages of {name}", "a topic of several", "Record it alone.")
         return topic
@@ -149,7 +149,9 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         ValueError: If rosbags is not installed, or there is no bag at the path, or it is damaged.
     """
     if find_spec("rosbags") is None:
-        raise argument_error("path", "the package rosbags for bags", "no such package", "Install it: pip install rosbags.")
+        raise argument_error(
+            "path", "the package rosbags for bags", "no such package", "Install it: pip install rosbags."
+        )
     file = checked_path(path)
     if not file.exists():
         raise argument_error("path", BAGS, "no such path", f"Check {str(path)!r}.")

@@ -18,7 +18,7 @@ FLOATS = (7, 8)
 class PoseReading(NamedTuple):
     """Pose of a message."""
 
-    stamp: int  # [ns] of the header
+    stamp: int  # Time stamp of the header [ns]
     frame: str  # Frame in which the pose is
     child: str  # Frame whose pose it is; empty: not said
     position: tuple[float, float, float]  # [m]
@@ -28,7 +28,7 @@ class PoseReading(NamedTuple):
 class TwistReading(NamedTuple):
     """Velocity of a message."""
 
-    stamp: int  # [ns] of the header
+    stamp: int  # Time stamp of the header [ns]
     frame: str  # Frame in which it is
     forward: float  # [m/s]
     sideways: float  # [m/s]
@@ -38,7 +38,7 @@ class TwistReading(NamedTuple):
 class Sighting(NamedTuple):
     """Landmarks seen at one time."""
 
-    stamp: int  # [ns] of the header
+    stamp: int  # Time stamp of the header [ns]
     frame: str  # Frame of the sensor
     names: list[str] | None  # (n,) Identities; None: not known
     points: Any  # (n, 3) [m], frame of the sensor
@@ -116,10 +116,16 @@ def _fiducials(message: Any, pattern: str) -> Iterator[Sighting]:
         yield _sighting(message.header, str(int(each.fiducial_id)), each.transform.translation)
 
 
+def _score(result: Any) -> float:
+    """Return what sorts results of a detection, the best first."""
+    hypothesis: Any = getattr(result, "hypothesis", result)
+    return -float(hypothesis.score)
+
+
 def _detections(message: Any, pattern: str) -> Iterator[Sighting]:
     """Yield detections of ROS 1 and ROS 2, named by their own identity or that of their best class."""
     for each in message.detections:
-        results = sorted(each.results, key=lambda result: -getattr(result, "hypothesis", result).score)
+        results = sorted(each.results, key=_score)
         header = each.header if each.header.frame_id else message.header
         name, position, covariance = str(getattr(each, "id", "")), each.bbox.center.position, None
         if results:
@@ -149,7 +155,7 @@ def _tag_frames(message: Any, pattern: str) -> Iterator[Sighting]:
 
 def _cloud(message: Any, pattern: str) -> Iterator[Sighting]:
     """Yield the points of a cloud with their field `id`, or else all other fields of floats as descriptors."""
-    count, order = int(message.width) * int(message.height), ">" if message.is_bigendian else "<"
+    count = int(message.width) * int(message.height)
     if count > MOST_IN_CLOUD:
         hint = "Landmarks are points with an identity or descriptor, not a scan."
         raise argument_error("landmarks", f"at most {MOST_IN_CLOUD:,} points in a message", count, hint)
@@ -173,7 +179,7 @@ def _cloud(message: Any, pattern: str) -> Iterator[Sighting]:
             got = f"a field {field.name!r} of type {field.datatype} at {field.offset}"
             raise argument_error("landmarks", "fields within a point", got, "Check what publishes it.")
         part = np.ascontiguousarray(cells[:, int(field.offset) : int(field.offset) + size])
-        return part.view(np.dtype(kind).newbyteorder(order))
+        return part.view(np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<"))
 
     points = np.concatenate([column(fields[name])[:, :1] for name in "xyz"], axis=1).astype(np.float64)
     names, described = None, None
@@ -207,7 +213,7 @@ LANDMARKS: dict[str, Callable[[Any, str], Iterable[Sighting]]] = {
 CAMERAS = ("sensor_msgs/CameraInfo",)
 # Types that lack what they seem to have, and the cure
 LACKING = {
-    "apriltag_msgs/AprilTagDetectionArray": "It has no poses, which are in /tf: give /tf, and --tag-frames for its tags.",
+    "apriltag_msgs/AprilTagDetectionArray": "It has no poses: they are in /tf, give /tf, and --tag-frames for its tags.",
     "nav_msgs/Path": "Give the topic of the single poses.",
     "geometry_msgs/Pose": "It has no time stamp: record PoseStamped.",
     "geometry_msgs/Twist": "It has no time stamp: record TwistStamped or Odometry.",

@@ -68,7 +68,7 @@ class BagSteps:
     Attributes:
         times: (T,) float64 [s]. Evenly spaced times by the stamps of the headers.
         robots: Steps of each robot, in the order of the topics.
-        kind: What distinguishes landmarks: "identities", "descriptors", or "positions" alone.
+        kind: Distinction of landmarks: by "identities", by "descriptors", or by "positions" alone.
         names: (N,) str. Identities, the columns of one-hot descriptors; empty without identities.
         camera: Camera of the robots; None: not given.
         notes: Lines about frames, sorted stamps, and what was dropped.
@@ -116,7 +116,7 @@ def bag_topics(path: str | Path) -> list[tuple[str, str, int, str]]:
         ValueError: If there is no bag at the path, or it is damaged, or rosbags is not installed.
     """
     with open_bag(path) as bag:
-        return [(name, topic.kind, topic.count, uses(topic.kind)) for name, topic in bag.topics.items()]
+        return [(name, topic.kind, topic.messages, uses(topic.kind)) for name, topic in bag.topics.items()]
 
 
 def load_bag(
@@ -151,7 +151,9 @@ def load_bag(
     for argument, given in (("landmarks", landmarks), ("truth", truth)):
         if given is not None and len(given) != count:
             hint = "Give one for each robot, in the same order."
-            raise argument_error(argument, f"{count} topic{'s' if count > 1 else ''}, as of odometry", list(given), hint)
+            raise argument_error(
+                argument, f"{count} topic{'s' if count > 1 else ''}, as of odometry", list(given), hint
+            )
     if base is not None and len(base) not in (1, count):
         raise argument_error("base", f"one frame or {count}", list(base), "Give one for all robots, or one for each.")
     notes: list[str] = []
@@ -193,7 +195,7 @@ def load_bag(
 
 
 def _times(argument: str, topic: str, stamps: Sequence[int], notes: list[str]) -> tuple[FloatArray, IntArray]:
-    """Return the times [s] of the messages with a stamp, in order, and their rows; append a note if they were sorted."""
+    """Return the times [s] of the messages with a stamp, in order, and their rows; append notes about them."""
     stamped = np.array(stamps, dtype=np.int64)
     kept = np.flatnonzero(stamped)
     if not len(kept):
@@ -201,7 +203,7 @@ def _times(argument: str, topic: str, stamps: Sequence[int], notes: list[str]) -
         raise argument_error(argument, f"time stamps in the headers of {topic}", "no stamp but zero", hint)
     if len(kept) < len(stamped):
         notes.append(f"{topic}: {len(stamped) - len(kept)} of {len(stamped)} messages without a stamp were dropped.")
-    times = stamped[kept] * 1e-9
+    times: FloatArray = np.asarray(stamped[kept] * 1e-9, np.float64)
     late = np.flatnonzero(steps_back(times) > MOST_JITTER)
     if len(late):
         row = int(late[0])
@@ -210,7 +212,7 @@ def _times(argument: str, topic: str, stamps: Sequence[int], notes: list[str]) -
         raise argument_error(argument, expected, got, "Cut the bag there, or correct the clock.")
     order, words = time_order(topic, times)
     notes.extend(sorted_note([words]))
-    return times[order], kept[order]
+    return times[order], kept[order].astype(np.int64)
 
 
 def _check_overlap(argument: str, topic: str, times: FloatArray, driven: _Driven) -> None:
@@ -230,7 +232,7 @@ def _static_frames(bag: Bag, topic: str) -> dict[str, tuple[str, Motion]]:
     spaces = [name for name in bag.topics if name == "tf_static" or name.endswith("/tf_static")]
     for name in sorted(spaces, key=len):
         about = bag.topics[name]
-        if about.count and about.kind == "tf2_msgs/TFMessage" and topic.startswith(name.removesuffix("tf_static")):
+        if about.messages and about.kind == "tf2_msgs/TFMessage" and topic.startswith(name.removesuffix("tf_static")):
             for message in bag.messages("path", name):
                 for each in transforms(message):
                     _, rotation = _rotations("path", name, np.array([each.quaternion]))
@@ -434,9 +436,7 @@ def _scaled(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(descriptors / np.where(lengths > 0.0, lengths, 1.0), np.float32)
 
 
-def _covariances(
-    rays: FloatArray, given: FloatArray, noise: SightingNoise, topic: str, notes: list[str]
-) -> FloatArray:
+def _covariances(rays: FloatArray, given: FloatArray, noise: SightingNoise, topic: str, notes: list[str]) -> FloatArray:
     """Return the covariances (m, 3, 3) [m^2], base axes, of points at these places (m, 3) from their sensor.
 
     Those given are kept if they are positive definite; others are of the assumed noise.
@@ -455,9 +455,7 @@ def _covariances(
     return covariances
 
 
-def _identities(
-    topics: Sequence[str], seen: Sequence[_Seen]
-) -> tuple[Kind, NDArray[np.str_], list[IntArray]]:
+def _identities(topics: Sequence[str], seen: Sequence[_Seen]) -> tuple[Kind, NDArray[np.str_], list[IntArray]]:
     """Return what distinguishes the landmarks of all robots, their names, and the name's index for each sighting."""
     kinds = {"identities" if each.names is not None else each.descriptors.shape[1] for each in seen}
     if len(kinds) > 1:
@@ -550,4 +548,3 @@ def _read_camera(
         max_range=max(usual.max_range, float(np.linalg.norm(points, axis=1).max())),
         mount=tuple(mount.translation.tolist()),
     )  # fmt: skip
-

@@ -194,7 +194,7 @@ def first_of_each(step: IntArray, identities: IntArray) -> IntArray:
         step: (m,) int64. Step of each sighting.
         identities: (m,) int64 >= 0.
     """
-    return np.unique(step * (identities.max(initial=0) + 1) + identities, return_index=True)[1]
+    return np.asarray(np.unique(step * (identities.max(initial=0) + 1) + identities, return_index=True)[1])
 
 
 def by_step(

@@ -186,9 +186,9 @@ def write_odometry(
     bag: Writer, topic: str = "/odom", robot: int = 0, seconds: float = 30.0, scale: float = 1.0,
     child: str = "base_link",
 ) -> None:  # fmt: skip
-    """Write odometry at 20 Hz in its own frame, whose speed is wrong by a factor."""
+    """Write odometry at 20 Hz in its own frame, whose turn rate is wrong by a factor."""
     times = np.arange(0.0, seconds, 0.05)
-    poses = integrate_commands([[0.0, SPEED * scale, TURN]], times, hold=1e6)
+    poses = integrate_commands([[0.0, SPEED, TURN * scale]], times, hold=1e6)
     for time, pose in zip(times, poses, strict=True):
         bag.write(topic, time, odometry(bag, float(time), pose, child))
 
@@ -263,6 +263,7 @@ def detections(bag: Writer, view: Views, frame: str = "base_link", in_box: bool 
 
 def markers(bag: Writer, view: Views, frame: str = "base_link") -> Any:
     """Return a `visualization_msgs/MarkerArray`, whose first entry deletes all."""
+
     def marker(number: int, point: Any, action: int) -> Any:
         vector = bag.make("geometry_msgs/Vector3", 0.1, 0.1, 0.1)
         colour = bag.make("std_msgs/ColorRGBA", 1.0, 0.0, 0.0, 1.0)

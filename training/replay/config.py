@@ -43,6 +43,8 @@ VICTORIA_MOTION = {
     "sigma_along": 0.03, "sigma_across": 0.03, "sigma_heading": 0.01, "sigma_turn": 0.1, "floor_position": 0.005,
     "floor_heading": 0.001,
 }  # fmt: skip
+# Assumed for tags of 10 to 20 cm up to 6 m away; messages with a covariance have their own.
+BAG_SENSOR = {"range_floor": 0.03, "range_share": 0.03, "bearing": 0.02, "height": 0.05}
 
 
 def log_path(below: Path, help: str = "Folder of the log.") -> Any:
@@ -174,7 +176,7 @@ class BagConfig(ReplayConfig):
     )
     dt: float = option(0.25, "Time between steps [s].", gt=0.0, hint="Give seconds, near those between two frames.")
     motion: OdometryModel = setting({}, "Assumed odometry noise.")
-    sensor: SightingNoise = setting({}, "Assumed noise of landmarks without covariance.")
+    sensor: SightingNoise = setting(BAG_SENSOR, "Assumed noise of landmarks without covariance.")
 
 
 class LogConfig(ReplayConfig):

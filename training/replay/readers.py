@@ -17,7 +17,7 @@ from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.readers import bags, kitti, mrclam, victoria
 from slam_backend.team.merge_scheduler import AttemptOptions
-from training.replay.config import MRCLAM_DRIVE, MRCLAM_MOTION, VICTORIA_MOTION
+from training.replay.config import BAG_SENSOR, MRCLAM_DRIVE, MRCLAM_MOTION, VICTORIA_MOTION
 from training.replay.core import Replay
 from training.replay.log import Log, RobotLog, Source
 from training.replay.metrics import PathScore, most_seen, travelled
@@ -218,6 +218,7 @@ def read_bag(
     dt: float = 0.25, motion: OdometryModel | None = None, sensor: mrclam.SightingNoise | None = None,
 ) -> Log:  # fmt: skip
     """Return a bag of ROS 1 or ROS 2: a robot for each topic of odometry, several as a team with unknown starts."""
+    sensor = mrclam.SightingNoise(**BAG_SENSOR) if sensor is None else sensor
     steps = bags.load_bag(path, odometry, landmarks, truth, camera, base, tag_frames, dt, sensor)
     given = steps.kind == "identities"
     robots = [

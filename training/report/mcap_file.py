@@ -13,12 +13,10 @@ from slam_backend.core.files import check_writable, move_file, os_errors_as_argu
 from slam_backend.core.validation import argument_error
 from training.report.recording import Recording, part_of
 from vslam_env.navigation.occupancy_grid import CELL, FREE, OCCUPIED
-from vslam_env.rendering.palette import robot_colour
 
-SPOT, LINE = 0.12, 0.04  # diameters of points and lines [m]
-GREY = (150, 152, 158)
+WIDTH = 0.04  # of walls [m]
 WORLD = "world"
-LINE_LIST, SPHERE_LIST = 5, 7  # types of markers
+LINE_LIST = 5  # type of markers
 DEBUG, INFO = 10, 20  # levels of log messages
 Array = NDArray[Any]
 Message = tuple[float, str, Any]  # time [s], topic, message
@@ -41,9 +39,9 @@ def write_mcap(recording: Recording, file: Path) -> Path:
     """Write an episode as an MCAP file of ROS 2 with the definitions of its messages.
 
     Stamps are seconds of the episode. Frames: `world`; `robot<k>`, the estimated pose; `robot<k>/start`, in which the
-    grid lies. Topics: `/tf`, `/tf_static`, `/world` (walls and true landmarks, once), `/events` (merges and attempts),
-    and `/robot<k>/estimate`, `truth`, `map` and `grid`. What robots share is with the first of them; the others have an
-    empty map and a grid of one unknown cell.
+    grid lies. Topics: `/tf`, `/tf_static`, `/walls` and `/landmarks` (true ones, once), `/events` (merges and
+    attempts), and `/robot<k>/estimate`, `truth`, `map` and `grid`. What robots share is with the first of them; the
+    others have an empty map and a grid of one unknown cell.
 
     Raises:
         ValueError: If rosbags is not installed or the file cannot be written.
@@ -68,10 +66,8 @@ def write_mcap(recording: Recording, file: Path) -> Path:
             for time, topic, message in sorted(_messages(recording, store.types), key=lambda each: each[0]):
                 kind = message.__msgtype__
                 if topic not in topics:
-                    profiles = [kept] if topic in ("/tf_static", "/world") else []
-                    topics[topic] = writer.add_connection(
-                        topic, kind, typestore=store, offered_qos_profiles=profiles
-                    )
+                    profiles = [kept] if topic in ("/tf_static", "/walls", "/landmarks") else []
+                    topics[topic] = writer.add_connection(topic, kind, typestore=store, offered_qos_profiles=profiles)
                 writer.write(topics[topic], round(time * 1e9), store.serialize_cdr(message, kind))
         move_file(next(parts.glob("*.mcap")), file, "mcap")
     return file
@@ -86,15 +82,10 @@ def _messages(recording: Recording, types: Any) -> Iterator[Message]:
     ]
     if starts:
         yield first, "/tf_static", types["tf2_msgs/msg/TFMessage"](starts)
-    known = [
-        _marker(types, first, number, kind, points, GREY)
-        for number, (kind, points) in enumerate(
-            ((LINE_LIST, recording.walls.reshape(-1, 2)), (SPHERE_LIST, recording.landmarks))
-        )
-        if len(points)
-    ]
-    if known:
-        yield first, "/world", types["visualization_msgs/msg/MarkerArray"](known)
+    if len(recording.walls):
+        yield first, "/walls", types["visualization_msgs/msg/MarkerArray"]([_walls(types, first, recording.walls)])
+    if len(recording.landmarks):
+        yield first, "/landmarks", _cloud(types, first, recording.landmarks)
     for step, moment in enumerate(recording.times):
         time = float(moment)
         placed = [robot for robot in robots if np.isfinite(recording.estimate[step, robot]).all()]
@@ -107,8 +98,12 @@ def _messages(recording: Recording, types: Any) -> Iterator[Message]:
             yield from _maps(recording, types, key, float(recording.times[step]), robot)
     for event in recording.about["events"]:
         time, level = float(event["time"]), INFO if event["success"] else DEBUG
-        yield time, "/events", types["rcl_interfaces/msg/Log"](
-            _stamp(types, time), level, str(event["kind"]), str(event["text"]), "", "", 0
+        yield (
+            time,
+            "/events",
+            types["rcl_interfaces/msg/Log"](
+                _stamp(types, time), level, str(event["kind"]), str(event["text"]), "", "", 0
+            ),
         )
 
 
@@ -132,8 +127,7 @@ def _maps(recording: Recording, types: Any, key: int, time: float, robot: int) -
     """Yield map and grid of a robot at a step that has them."""
     if recording.map_ends.size:
         points = recording.map_points[part_of(recording.map_ends, key, robot), :2]
-        spots = _marker(types, time, 0, SPHERE_LIST, points, robot_colour(robot))
-        yield time, f"/robot{robot}/map", types["visualization_msgs/msg/MarkerArray"]([spots])
+        yield time, f"/robot{robot}/map", _cloud(types, time, points)
     if recording.grid_ends.size:
         x, y, rows, columns = recording.grid_boxes[key, robot]
         runs = part_of(recording.grid_ends, key, robot)
@@ -143,11 +137,11 @@ def _maps(recording: Recording, types: Any, key: int, time: float, robot: int) -
         size = int(columns), int(rows)
         if not len(cells):
             data, size = np.array([-1], np.int8), (1, 1)
-        about = types["nav_msgs/msg/MapMetaData"](
-            _stamp(types, time), CELL, *size, _pose(types, np.array([x, y, 0.0]))
-        )
-        yield time, f"/robot{robot}/grid", types["nav_msgs/msg/OccupancyGrid"](
-            _header(types, time, f"robot{robot}/start"), about, data
+        about = types["nav_msgs/msg/MapMetaData"](_stamp(types, time), CELL, *size, _pose(types, np.array([x, y, 0.0])))
+        yield (
+            time,
+            f"/robot{robot}/grid",
+            types["nav_msgs/msg/OccupancyGrid"](_header(types, time, f"robot{robot}/start"), about, data),
         )
 
 
@@ -176,17 +170,25 @@ def _transform(types: Any, time: float, frame: str, child: str, pose: Array) -> 
     return types["geometry_msgs/msg/TransformStamped"](_header(types, time, frame), child, moved)
 
 
-def _marker(types: Any, time: float, number: int, kind: int, points: Array, colour: tuple[int, int, int]) -> Any:
-    """Return a marker of lines or spheres at points (n, 2) [m], world frame."""
-    size = LINE if kind == LINE_LIST else SPOT
+def _cloud(types: Any, time: float, points: Array) -> Any:
+    """Return a cloud of points (n, 2) [m], world frame."""
+    field, count = types["sensor_msgs/msg/PointField"], len(points)
+    fields = [field(name, 4 * number, 7, 1) for number, name in enumerate("xyz")]  # float32
+    data = np.column_stack([points, np.zeros(count)]).astype("<f4").view(np.uint8).ravel()
+    header = _header(types, time, WORLD)
+    return types["sensor_msgs/msg/PointCloud2"](header, 1, count, fields, False, 12, 12 * count, data, True)
+
+
+def _walls(types: Any, time: float, walls: Array) -> Any:
+    """Return a marker of lines (s, 4) x1, y1, x2, y2 [m], world frame."""
     nothing = np.zeros(0, np.uint8)
     point = types["geometry_msgs/msg/Point"]
     return types["visualization_msgs/msg/Marker"](
-        header=_header(types, time, WORLD), ns="", id=number, type=kind, action=0, pose=_pose(types, np.zeros(3)),
-        scale=types["geometry_msgs/msg/Vector3"](size, size, size),
-        color=types["std_msgs/msg/ColorRGBA"](*(part / 255.0 for part in colour), 1.0),
+        header=_header(types, time, WORLD), ns="", id=0, type=LINE_LIST, action=0, pose=_pose(types, np.zeros(3)),
+        scale=types["geometry_msgs/msg/Vector3"](WIDTH, WIDTH, WIDTH),
+        color=types["std_msgs/msg/ColorRGBA"](0.6, 0.6, 0.6, 1.0),
         lifetime=types["builtin_interfaces/msg/Duration"](0, 0), frame_locked=False,
-        points=[point(float(x), float(y), 0.0) for x, y in points], colors=[], texture_resource="",
+        points=[point(float(x), float(y), 0.0) for x, y in walls.reshape(-1, 2)], colors=[], texture_resource="",
         texture=types["sensor_msgs/msg/CompressedImage"](_header(types, 0.0, ""), "", nothing), uv_coordinates=[],
         text="", mesh_resource="", mesh_file=types["visualization_msgs/msg/MeshFile"]("", nothing),
         mesh_use_embedded_materials=False,

@@ -196,7 +196,9 @@ def test_a_cloud_of_bare_points_is_matched_by_position(tmp_path: Path) -> None:
     """Without identities and descriptors all descriptors are equal, which a note says; NaN points are dropped."""
 
     def look(bag: Any, view: Any) -> Any:
-        return bags.cloud(bag, view._replace(points=np.where(np.arange(len(view.ids))[:, None] == 0, np.nan, view.points)))
+        return bags.cloud(
+            bag, view._replace(points=np.where(np.arange(len(view.ids))[:, None] == 0, np.nan, view.points))
+        )
 
     steps = load(write_circle(tmp_path / "cloud.mcap", look, seconds=SECONDS))
     assert steps.kind == "positions"
@@ -245,7 +247,9 @@ def test_a_camera_gives_field_of_view_and_place(tmp_path: Path) -> None:
             np.testing.assert_allclose(one + OPTICAL[0], other, atol=1e-12)
     with pytest.raises(ValueError, match=r"camera: expected focal lengths > 0 in K or P of /blank, got \[0.0, 0.0\]"):
         load(path, camera="/blank")
-    with pytest.raises(ValueError, match=r"camera: expected a camera that looks along x of 'base_link', to 0.2 rad, got"):
+    with pytest.raises(
+        ValueError, match=r"camera: expected a camera that looks along x of 'base_link', to 0.2 rad, got"
+    ):
         load(path, camera="/left")
     with pytest.raises(ValueError, match=r"camera: expected a type of /odom that can be read, got 'nav_msgs/Odometry'"):
         load(path, camera="/odom")
@@ -296,7 +300,7 @@ def _write_refused(path: Path) -> None:
             bag.write("/elsewhere", view.time, bags.tags(bag, view, "gripper"))
             bag.write("/frames", view.time, bags.frames(bag, view))
             bag.write("/odd", view.time, bags.cloud(bag, view, extra={"id": view.ids}))
-            bag.write("/two_gates", view.time, bags.tags(bag, view, "optical"))
+            bag.write("/bare", view.time, bags.cloud(bag, view))
         bags.write_static(bag, "optical", "mast")
         jump = VIEWS[0]._replace(time=1.0)
         for number, time in enumerate((4.0, 1.0, 4.5)):
@@ -305,29 +309,33 @@ def _write_refused(path: Path) -> None:
             for time in (0.0, 1.0):
                 bag.write(f"/pose{number}", time, odometry(bag, time, np.zeros(3), tilt=quaternion))
         bag.write("/single", 0.0, odometry(bag, 0.0, np.zeros(3)))
-        bag.write("/detected", 0.0, bag.make("apriltag_msgs/AprilTagDetectionArray", bag.header(0.0, ""), np.ones(1, np.int32)))
+        bag.write(
+            "/detected",
+            0.0,
+            bag.make("apriltag_msgs/AprilTagDetectionArray", bag.header(0.0, ""), np.ones(1, np.int32)),
+        )
         bag.write("/words", 0.0, bag.make("std_msgs/String", "hello"))
         bag.empty_topic("/silent", "nav_msgs/Odometry")
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "misspelt": ({"landmarks": ["/tag"]}, r"landmarks: expected a topic of the bag, got '/tag'. Did you mean '/tags'\?"),
+    "misspelt": ({"landmarks": ["/tag"]}, r"expected a topic of the bag, got '/tag'. Did you mean '/tags'\?"),
     "silent": ({"odometry": ["/silent"]}, r"odometry: expected messages of /silent, got no message"),
     "type": ({"odometry": ["/words"]}, r"odometry: expected a type of /words that can be read, got 'std_msgs/String'."
              r" Give a topic of nav_msgs/Odometry, "),
-    "no poses": ({"landmarks": ["/detected"]}, r"got 'apriltag_msgs/AprilTagDetectionArray'. It has no poses, which are"),
+    "no poses": ({"landmarks": ["/detected"]}, r"got 'apriltag_msgs/AprilTagDetectionArray'. It has no poses: they"),
     "unstamped": ({"landmarks": ["/unstamped"]}, r"expected time stamps in the headers of /unstamped, got no stamp"),
     "two clocks": ({"landmarks": ["/other_clock"]}, r"expected stamps of /other_clock among those of the odometry, "),
-    "back": ({"landmarks": ["/back"]}, r"stamps of /back that go back by at most 1 s, got a stamp 1700000001.000 s after"),
+    "back": ({"landmarks": ["/back"]}, r"stamps of /back that go back by at most 1 s, got a stamp 1700000001.0"),
     "no chain": ({"landmarks": ["/elsewhere"]}, r"expected static frames from 'gripper' of /elsewhere to 'base_link', "
                  r"got no such chain. /tf_static has mast, optical: name the robot's frame by --base."),
-    "quaternion": ({"odometry": ["/pose0"]}, r"odometry: expected unit quaternions of /pose0, got \[0.0, 0.0, 0.0, 2.0\]"),
-    "tilt": ({"odometry": ["/pose1"]}, r"poses of /pose1 tilted by at most 0.2 rad, got a tilt of 0.30 rad at 17000000"),
+    "quaternion": ({"odometry": ["/pose0"]}, r"expected unit quaternions of /pose0, got \[0.0, 0.0, 0.0, 2.0\]"),
+    "tilt": ({"odometry": ["/pose1"]}, r"/pose1 tilted by at most 0.2 rad, got a tilt of 0.30 rad at 17000000"),
     "single": ({"odometry": ["/single"]}, r"odometry: expected two poses of /single or more, got a single one"),
     "no such tags": ({"landmarks": ["/frames"], "tag_frames": "qr*"}, r"landmarks in /frames, got no landmark"),
-    "numbers": ({"landmarks": ["/tags", "/odd"]}, r"landmarks: expected 1 topic, as of odometry, got \['/tags', '/odd'\]"),
+    "numbers": ({"landmarks": ["/tags", "/odd"]}, r"expected 1 topic, as of odometry, got \['/tags', '/odd'\]"),
     "bases": ({"base": ["a", "b"]}, r"base: expected one frame or 1, got \['a', 'b'\]"),
-    "kinds": ({"odometry": ["/odom", "/odom"], "landmarks": ["/tags", "/words"]}, r"type of /words that can be read"),
+    "kinds": ({"odometry": ["/odom", "/odom"], "landmarks": ["/tags", "/bare"]}, r"one kind of landmarks, got"),
     "truth": ({"truth": ["/words"]}, r"truth: expected a type of /words that can be read, got 'std_msgs/String'"),
     "dt": ({"dt": 0.0}, r"dt: expected a finite number > 0, got 0.0"),
     "steps": ({"dt": 1e-6}, r"dt: expected at most 1,000,000 steps, got"),
@@ -369,13 +377,12 @@ def test_damaged_bags_are_one_line(damage: Callable[[Path], Any], name: str, tmp
     """A bag that is cut, has wrong bytes or is empty is refused, or read as it is; nothing else is raised."""
     path = write_circle(tmp_path / name, seconds=SECONDS)
     damage(next(path.glob("*.db3")) if path.is_dir() else path)
+    error = None
     try:
         load(path)
-    except ValueError as error:
-        assert ": expected " in str(error)
-        assert "\n" not in str(error)
-    else:
-        assert damage is _scramble
+    except ValueError as raised:
+        error = str(raised)
+    assert damage is _scramble if error is None else ": expected " in error and "\n" not in error
 
 
 def test_definitions_of_a_bag_are_words_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -412,7 +419,7 @@ def test_paths_that_are_no_bags_are_refused(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(ValueError, match=r"got a folder without it. Name a file in it: circle.mcap."):
         bag_topics(tmp_path)
     monkeypatch.setattr("slam_backend.readers.bag_files.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"path: expected the package rosbags for bags, got no such package. Install it"):
+    with pytest.raises(ValueError, match=r"path: expected the package rosbags for bags, got no such package"):
         bag_topics(tmp_path / "circle.mcap")
 
 
