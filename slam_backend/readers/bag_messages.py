@@ -213,7 +213,7 @@ LANDMARKS: dict[str, Callable[[Any, str], Iterable[Sighting]]] = {
 CAMERAS = ("sensor_msgs/CameraInfo",)
 # Types that lack what they seem to have, and the cure
 LACKING = {
-    "apriltag_msgs/AprilTagDetectionArray": "It has no poses: they are in /tf, give /tf, and --tag-frames for its tags.",
+    "apriltag_msgs/AprilTagDetectionArray": "It has no poses: they are in /tf, so give /tf and --tag-frames.",
     "nav_msgs/Path": "Give the topic of the single poses.",
     "geometry_msgs/Pose": "It has no time stamp: record PoseStamped.",
     "geometry_msgs/Twist": "It has no time stamp: record TwistStamped or Odometry.",

@@ -184,7 +184,7 @@ def nearest_steps(times: FloatArray, stamps: FloatArray) -> IntArray:
     [0, 1, 2]
     """
     step = np.rint((stamps - times[0]) / (times[1] - times[0])).astype(np.int64) if len(times) > 1 else 0
-    return np.clip(np.broadcast_to(step, len(stamps)), 0, len(times) - 1)
+    return np.asarray(np.clip(np.broadcast_to(step, len(stamps)), 0, len(times) - 1))
 
 
 def first_of_each(step: IntArray, identities: IntArray) -> IntArray:
