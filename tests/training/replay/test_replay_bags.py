@@ -18,6 +18,7 @@ pytest.importorskip("rosbags", reason="rosbags is not installed: pip install .[r
 ONE = ("--odometry", "/odom", "--landmarks", "/tags")
 
 
+@pytest.mark.slow
 def test_the_landmarks_of_a_bag_are_found(vslam: Any, tmp_path: Path) -> None:
     """The map has each tag that was seen near its place, and the path is better than its odometry; a run repeats."""
     path, run, again = tmp_path / "circle.mcap", tmp_path / "run", tmp_path / "again"
@@ -37,6 +38,7 @@ def test_the_landmarks_of_a_bag_are_found(vslam: Any, tmp_path: Path) -> None:
     assert metrics == json.loads((again / "metrics.json").read_text())
 
 
+@pytest.mark.slow
 def test_robots_of_a_bag_find_each_other(vslam: Any, tmp_path: Path) -> None:
     """Two robots with unknown starts end in one group; alone they do not."""
     path = tmp_path / "team.bag"
