@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.files import check_writable
 from slam_backend.core.validation import argument_error
-from training.report.recording import Recording
+from training.report.recording import Recording, part_of
 from vslam_env.rendering.palette import robot_colour
 
 TIMELINE = "episode"
@@ -98,7 +98,7 @@ def _log_robot(
     if len(path) > 1:
         stream.log(f"{root}/path", rerun.LineStrips2D([_picture(path)], radii=LINE, colors=[colour]))
     if recording.sight_ends.size:
-        seen = recording.sights[_part(recording.sight_ends, step, robot)]
+        seen = recording.sights[part_of(recording.sight_ends, step, robot)]
         x, y = (float(value) for value in recording.truth[step, robot, :2])
         lines = np.stack([np.broadcast_to([x, y], seen.shape), seen], axis=1)
         stream.log(f"{root}/sights", rerun.LineStrips2D(_picture(lines), radii=0.3 * LINE, colors=[colour]))
@@ -111,18 +111,11 @@ def _log_robot(
 
 def _log_map(rerun: Any, stream: Any, recording: Recording, key: int, robot: int, colour: tuple[int, int, int]) -> None:
     """Log map and candidates of a robot at a step that has them; a shared map is logged with its first robot."""
-    points = recording.map_points[_part(recording.map_ends, key, robot), :2]
+    points = recording.map_points[part_of(recording.map_ends, key, robot), :2]
     stream.log(f"robots/{robot}/map", rerun.Points2D(_picture(points), radii=SPOT, colors=[colour]))
     if recording.candidate_ends.size:
-        rows = recording.candidates[_part(recording.candidate_ends, key, robot)]
+        rows = recording.candidates[part_of(recording.candidate_ends, key, robot)]
         goals = rows[rows[:, 3] > 0]
         places = rerun.Points2D(_picture(rows[:, :2]), radii=SPOT, colors=[GREY])
         stream.log(f"robots/{robot}/candidates", places)
         stream.log(f"robots/{robot}/goal", rerun.Points2D(_picture(goals[:, :2]), radii=2 * SPOT, colors=[colour]))
-
-
-def _part(ends: Array, row: int, robot: int) -> slice:
-    """Return the part of concatenated rows that belongs to a step and a robot."""
-    index = row * ends.shape[1] + robot
-    flat = ends.ravel()
-    return slice(int(flat[index - 1]) if index else 0, int(flat[index]))

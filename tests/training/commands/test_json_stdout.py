@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import typer.main
+from builders.bags import write_circle
 from small_logs import write_drive, write_log, write_park
 
 from training import cli
@@ -24,6 +25,9 @@ LEAST = {
     "replay victoria": ("--path", "park", "--duration", "6", "--particles", "3"),
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
+    "replay bag": (
+        "--path", "circle.mcap", "--odometry", "/odom", "--landmarks", "/tags", "--duration", "3", "--particles", "3",
+    ),
     "bench speed filter": (
         "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
     ),
@@ -64,6 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_log(made / "robots", noise=1.0)
     write_park(made / "park")
     write_drive(made / "drive")
+    write_circle(made / "circle.mcap", seconds=5.0)
     return made
 
 

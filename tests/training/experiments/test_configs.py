@@ -45,6 +45,7 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     replay.KittiConfig: {"path": "drive", "truth": "poses.txt"},
     replay.MrclamConfig: {"path": "log", "robots": (1, 4), "motion": {"sigma_along": 0.125}},
     replay.LogConfig: {"path": "log", "particles": 7},
+    replay.BagConfig: {"path": "log.bag", "odometry": ("/odom",), "sensor": {"height": 0.125}},
     replay.VictoriaConfig: {"path": "log", "sensor": {"range": 0.25}}, RunConfig: {"world": "maze", "max_cycles": 12},
 }  # fmt: skip
 KINDS = [pytest.param(kind, id=kind.__name__) for kind in CASES]
@@ -124,6 +125,10 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "drive": {3: "a table of delay, speed, turn"}, "duration": {float("nan"): ABOVE_0},
     },
     replay.LogConfig: {"particles": {0: AT_LEAST_1}},
+    replay.BagConfig: {
+        "dt": {0.0: ABOVE_0}, "odometry": {(): "at least one value, each once"}, "particles": {0: AT_LEAST_1},
+        "alone": {"yes": "a bool"},
+    },
     replay.VictoriaConfig: {"particles": {True: AT_LEAST_1, 2.5: AT_LEAST_1}},
     RunConfig: {
         "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
