@@ -1,7 +1,7 @@
 """Planar pose graphs with landmarks, as g2o and GTSAM optimise them."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from slam_backend.trajectory import Trajectory
 LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"  # of robots; L is that of landmarks
 
 
+@short_repr
 class Factors(NamedTuple):
     """Gaussian measurements of one kind.
 
@@ -33,26 +34,25 @@ class Factors(NamedTuple):
         return cls(rows, np.zeros((0, size)), np.zeros((0, size, size)))
 
 
-@short_repr
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class PoseGraph:
     """Poses of one or more robots, landmarks, and measurements between them, in one frame. Arrays are read-only copies.
 
-    The covariance of a motion is in axes of the second pose as measured, that of a prior of a pose in axes of the prior:
-    the error is measured^-1 x predicted, as in g2o and in `BetweenFactorPose2` and `PriorFactorPose2` of GTSAM.
+    The covariance of a motion is in axes of the second pose as measured, that of a prior of a pose in its own axes: the
+    error is measured^-1 x predicted, as in g2o and in `BetweenFactorPose2` and `PriorFactorPose2` of GTSAM.
 
     Attributes:
         poses: (n, 3) float64 [m, m, rad]. Estimated poses; those of a robot in order of time.
-        robots: (n,) int64. Robot of each pose, from 0.
-        pose_ids: (n,) int64 >= 0. Number of each pose, once for each robot.
+        robots: (n,) int64. Robot of each pose, from 0. Default: all 0.
+        pose_ids: (n,) int64 >= 0. Number of each pose, once for each robot. Default: from 0 on.
         times: (n,) float64. Time stamp or step of each pose; None: unknown.
         landmarks: (l, 2) float64 [m]. Estimated positions.
-        landmark_ids: (l,) int64 >= 0, each once.
+        landmark_ids: (l,) int64 >= 0, each once. Default: from 0 on.
         motions: Measured motions (dx, dy, dtheta) from one pose to another, in the frame of the first.
         sightings: Measured points of landmarks in frames of poses; rows are (pose, landmark).
         pose_priors: Priors of poses.
         landmark_priors: Priors of landmarks.
-        fixed: (n,) bool. Poses that are known exactly.
+        fixed: (n,) bool. Poses that are known exactly. Default: none.
         pose_covariances: (n, 3, 3) float64. Marginal covariances of `poses` in the frame of the graph; None: unknown.
         landmark_covariances: (l, 2, 2) float64 [m^2]. Marginal covariances of `landmarks`; None: unknown.
 
@@ -66,52 +66,56 @@ class PoseGraph:
     """
 
     poses: FloatArray
-    robots: IntArray = field(default=None)  # type: ignore[assignment]
-    pose_ids: IntArray = field(default=None)  # type: ignore[assignment]
+    robots: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    pose_ids: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     times: FloatArray | None = None
     landmarks: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    landmark_ids: IntArray = field(default=None)  # type: ignore[assignment]
+    landmark_ids: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     motions: Factors = field(default_factory=lambda: Factors.none(3))
     sightings: Factors = field(default_factory=lambda: Factors.none(2))
     pose_priors: Factors = field(default_factory=lambda: Factors.none(3, linked=False))
     landmark_priors: Factors = field(default_factory=lambda: Factors.none(2, linked=False))
-    fixed: BoolArray = field(default=None)  # type: ignore[assignment]
+    fixed: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     pose_covariances: FloatArray | None = None
     landmark_covariances: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        n, num = len(np.atleast_1d(self.poses)), len(np.atleast_1d(self.landmarks))
-        robots = np.zeros(n, dtype=np.int64) if self.robots is None else self.robots
-        each = "Give one entry for each pose."
-        parts: dict[str, object] = {
-            "poses": check_array("poses", self.poses, (None, 3), "Give rows (x, y, theta)."),
-            "landmarks": check_array("landmarks", self.landmarks, (None, 2), "Give rows (x, y)."),
-            "robots": _ids("robots", robots, n, each),
-            "pose_ids": _ids("pose_ids", np.arange(n) if self.pose_ids is None else self.pose_ids, n, each),
-            "landmark_ids": _ids(
-                "landmark_ids", np.arange(num) if self.landmark_ids is None else self.landmark_ids, num,
-                "Give one id for each landmark.",
-            ),
-            "fixed": np.zeros(n, dtype=np.bool_) if self.fixed is None else np.array(self.fixed, dtype=np.bool_),
-            "times": None if self.times is None else check_array("times", self.times, (n,), each),
-        }  # fmt: skip
-        for name, size, count in (("pose_covariances", 3, n), ("landmark_covariances", 2, num)):
-            given = getattr(self, name)
-            parts[name] = None if given is None else check_array(name, given, (count, size, size), "Give a matrix each.")
-        for name, size, counts in (
-            ("motions", 3, (n, n)), ("sightings", 2, (n, num)), ("pose_priors", 3, (n,)), ("landmark_priors", 2, (num,)),
-        ):  # fmt: skip
-            parts[name] = _checked(name, getattr(self, name), size, counts)
-        for name, part in parts.items():
-            for array in part if isinstance(part, Factors) else (part,):
-                if isinstance(array, np.ndarray):
-                    array.setflags(write=False)
-            object.__setattr__(self, name, part)
-        if self.fixed.shape != (n,):
-            raise argument_error("fixed", f"an array of shape ({n},)", f"shape {self.fixed.shape}", each)
-        for name, keys in (("pose_ids", np.column_stack([self.robots, self.pose_ids])), ("landmark_ids", self.landmark_ids)):
+        poses: FloatArray = check_array("poses", self.poses, (None, 3), "Give rows (x, y, theta).")
+        landmarks: FloatArray = check_array("landmarks", self.landmarks, (None, 2), "Give rows (x, y).")
+        n, num, hint = len(poses), len(landmarks), "Give one entry for each pose."
+        robots = _ids("robots", self.robots, np.zeros(n, dtype=np.int64), hint)
+        pose_ids = _ids("pose_ids", self.pose_ids, np.arange(n), hint)
+        landmark_ids = _ids("landmark_ids", self.landmark_ids, np.arange(num), "Give one id for each landmark.")
+        fixed = np.array(self.fixed if len(self.fixed) else np.zeros(n), dtype=np.bool_)
+        if fixed.shape != (n,):
+            raise argument_error("fixed", f"an array of shape ({n},)", f"shape {fixed.shape}", hint)
+        for name, keys in (("pose_ids", np.column_stack([robots, pose_ids])), ("landmark_ids", landmark_ids[:, None])):
             if len(np.unique(keys, axis=0)) < len(keys):
                 raise argument_error(name, "distinct ids", "a repeated one", "Give each pose and landmark its own.")
+        parts: dict[str, Any] = {
+            "poses": poses, "robots": robots, "pose_ids": pose_ids, "landmarks": landmarks,
+            "landmark_ids": landmark_ids, "fixed": fixed,
+        }  # fmt: skip
+        for name, shape in (
+            ("times", (n,)), ("pose_covariances", (n, 3, 3)), ("landmark_covariances", (num, 2, 2)),
+        ):  # fmt: skip
+            if getattr(self, name) is not None:
+                parts[name] = check_array(name, getattr(self, name), shape, "Give one entry for each, or None.")
+        for name, array in parts.items():
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for name, size, counts in (
+            ("motions", 3, (n, n)), ("sightings", 2, (n, num)), ("pose_priors", 3, (n,)),
+            ("landmark_priors", 2, (num,)),
+        ):  # fmt: skip
+            object.__setattr__(self, name, _checked(name, getattr(self, name), size, counts))
+
+    def __repr__(self) -> str:
+        counts = (
+            f"{len(self.poses)} poses of {self.num_robots} robots", f"{len(self.landmarks)} landmarks",
+            f"{len(self.motions.rows)} motions", f"{len(self.sightings.rows)} sightings",
+        )  # fmt: skip
+        return f"PoseGraph({', '.join(counts)})"
 
     @property
     def num_robots(self) -> int:
@@ -145,13 +149,15 @@ class PoseGraph:
         steps = times.astype(np.int64)
         rows, steps = rows[steps >= 0], steps[steps >= 0]
         if len(steps) and steps.max() >= len(given):
-            raise argument_error("step_times", f"at least {steps.max() + 1} times", len(given), "Give one for each step.")
+            raise argument_error(
+                "step_times", f"at least {steps.max() + 1} times", len(given), "Give one for each step."
+            )
         return Trajectory(given[steps], self.poses[rows])
 
 
-def _ids(name: str, value: object, count: int, hint: str) -> IntArray:
-    """Return ids (count,) that are not negative, or raise."""
-    ids: IntArray = check_array(name, value, (count,), hint, dtype=np.int64)
+def _ids(name: str, given: ArrayLike, usual: IntArray, hint: str) -> IntArray:
+    """Return ids that are not negative, the usual ones (count,) if none are given, or raise."""
+    ids: IntArray = check_array(name, given if np.size(given) else usual, usual.shape, hint, dtype=np.int64)
     if len(ids) and ids.min() < 0:
         raise argument_error(name, "ints >= 0", int(ids.min()), hint)
     return ids
@@ -170,6 +176,8 @@ def _checked(name: str, given: Factors, size: int, counts: tuple[int, ...]) -> F
     if not positive_definite(covariances).all():
         got = f"a matrix that is not, at index {int(np.argmin(positive_definite(covariances)))}"
         raise argument_error(f"{name}.covariances", "symmetric positive definite matrices", got, "Check them.")
+    for array in (rows, values, covariances):
+        array.setflags(write=False)
     return Factors(rows, values, covariances)
 
 
@@ -190,7 +198,7 @@ def positive_definite(matrices: FloatArray) -> BoolArray:
 
 
 def rotated(covariances: FloatArray, angles: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) [m, m, rad] in axes turned by -`angles` (n,) [rad]: R C R^T, R turning by `angles`."""
+    """Return covariances (n, 3, 3) of poses [m, m, rad] turned by angles (n,) [rad]: R C R^T."""
     cos, sin = np.cos(angles), np.sin(angles)
     turn = np.zeros((len(angles), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = cos, -sin, sin, cos, 1.0

@@ -43,16 +43,16 @@ def read_graph(path: str | Path, name: str = "path") -> PoseGraph:
     its motions. Poses are in order of their ids; where no motion links a pose to the one before, another robot begins.
     A pose and a landmark may have the same id, as in files that GTSAM writes.
 
-    Records of pyfg are VERTEX_SE2, VERTEX_XY, both with :PRIOR, EDGE_SE2 and EDGE_SE2_XY, with covariances. Names have a
-    letter of the robot, L for a landmark. Poses are in order of robots and of the file.
+    Records of pyfg are VERTEX_SE2, VERTEX_XY, both with :PRIOR, EDGE_SE2 and EDGE_SE2_XY, with covariances. Names have
+    a letter of the robot, L for a landmark. Poses are in order of robots and of the file.
 
     Args:
         path: Text file of at most 256 MiB.
         name: The argument that gave the path, for errors.
 
     Raises:
-        ValueError: If the file is missing or too large, has a record of another type, a malformed line, a number that is
-            not finite, a matrix that is not positive definite, or an id that is unknown or repeated; with the line.
+        ValueError: If the file is missing or too large, has a record of another type, a malformed line, a number that
+            is not finite, a matrix that is not positive definite, or an id that is unknown or repeated; with the line.
     """
     kind = _format(path, name)
     text = read_text(path, name, f"a pose graph ({kind})", MOST_MEGABYTES)
@@ -168,7 +168,7 @@ class _Reader:
         rows = {"pose": {node: row for row, node in enumerate(nodes)}}
         landmarks = self._vertices["landmark"] if self._named else dict(sorted(self._vertices["landmark"].items()))
         rows["landmark"] = {node: row for row, node in enumerate(landmarks)}
-        factors = {field: self._factors(field, rows) for field in self._found}
+        factors: dict[str, Any] = {field: self._factors(field, rows) for field in self._found}
         fixed = np.zeros(len(nodes), dtype=np.bool_)
         for number, node in self._fixed:
             if node in rows["pose"]:
@@ -239,7 +239,7 @@ class _Reader:
 
 
 def _chains(count: int, rows: IntArray) -> IntArray:
-    """Return the robot (count,) of poses in order of ids: a new one where no motion (m, 2) leads from the one before."""
+    """Return the robot (count,) of poses in order of ids: a new one where no motion (m, 2) links it to the last."""
     linked = np.zeros(max(count, 1), dtype=np.bool_)
     low = rows.min(axis=1, initial=count)
     linked[low[np.abs(rows[:, 1] - rows[:, 0]) == 1] + 1] = True
@@ -269,11 +269,11 @@ def _g2o_lines(graph: PoseGraph) -> Iterator[str]:
         yield _line("VERTEX_SE2", [i], pose)
     for i, landmark in zip(ids["landmark"], graph.landmarks, strict=True):
         yield _line("VERTEX_XY", [i], landmark)
-    for row in np.flatnonzero(graph.fixed).tolist():
-        yield f"FIX {ids['pose'][row]}"
     for tag, (field, kinds, size) in G2O.items():
         if tag != "LANDMARK2":
             yield from _factor_lines(tag, getattr(graph, field), [ids[kind] for kind in kinds], size, None)
+    for row in np.flatnonzero(graph.fixed).tolist():  # last, as GTSAM reads no further
+        yield f"FIX {ids['pose'][row]}"
 
 
 def _pyfg_lines(graph: PoseGraph) -> Iterator[str]:

@@ -77,7 +77,7 @@ def _grown(
     New steps begin at the odometry from the smoothed ones, so that no initial pose is far from the optimum.
     """
     firsts = [int(log.steps[0]) if len(log) and log.kinds[0] != ODOMETRY else -1 for log in logs]
-    steps = np.where(graph.robots >= 0, np.array(firsts)[graph.robots], -1)
+    steps = np.where(graph.robots >= 0, np.array(firsts)[np.maximum(graph.robots, 0)], -1)
     last = max(int(log.steps[-1]) for log in logs if len(log))
     done = -1
     while done < last:
@@ -163,7 +163,7 @@ def _matrices(upper: FloatArray) -> FloatArray:
 
 
 def _marginals(graph: SlamGraph, mode: MapEstimate, keys: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the marginal covariances of poses (n, 3, 3) by key (n,), zeros of fixed ones, and of landmarks (l, 2, 2)."""
+    """Return the marginal covariances of poses (n, 3, 3) by key (n,), 0 if fixed, and of landmarks (l, 2, 2)."""
     poses, landmarks = np.zeros((len(keys), 3, 3)), np.zeros((len(graph.landmark_ids), 2, 2))
     system = mode.system
     assert system is not None

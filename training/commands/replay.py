@@ -20,6 +20,7 @@ from training.replay.config import (
     MRCLAM,
     PAIRS,
     VICTORIA,
+    GraphConfig,
     ImagesConfig,
     KittiConfig,
     LogConfig,
@@ -115,6 +116,15 @@ def replay_stereo(call: Call[ImagesConfig]) -> None:
             hint = "Omit it: two pairs are aligned in space."
             raise argument_error(name, "a drive of three pairs or more", "a folder with two pairs", hint)
     _align_pairs(call, ImagesConfig.from_mapping({"max_range": PAIR_RANGE} | values | names))
+
+
+@replay.command("graph")
+@options(GraphConfig, "replay graph")
+def replay_graph(call: Call[GraphConfig]) -> None:
+    """Replay a pose graph of g2o or PyFactorGraph with landmarks: its odometry and sightings, identities given."""
+    from training.replay.graphs import read_graph_log
+
+    _replay(call, call.config, read_graph_log)
 
 
 @replay.command(OWN)

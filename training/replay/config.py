@@ -148,6 +148,13 @@ class ImagesConfig(ReplayConfig):
         return StereoFiles(**{name: value for name, value in given.items() if value is not None})
 
 
+class GraphConfig(ReplayConfig):
+    """Replay of a pose graph with landmarks; the odometry noise is fitted to its edges."""
+
+    path: str = option(..., "Pose graph: .g2o, .pyfg or .fg.", hint="Give --path.", is_path=True)
+    truth: str | None = option(None, "Pose graph whose vertices are true.", shown="none", is_path=True)
+
+
 class LogConfig(ReplayConfig):
     """Replay of a log by a reader of the user; what is not given is as in the log, or else as for other logs."""
 

@@ -13,7 +13,9 @@ from slam_backend.models.camera import ROBOT_FROM_CAMERA
 from slam_backend.pose_graph import PoseGraph
 from slam_backend.readers.pose_graphs import write_graph
 
-MOTION = OdometryModel(sigma_along=0.05, sigma_across=0.03, sigma_heading=0.03, floor_position=0.005, floor_heading=0.004)
+MOTION = OdometryModel(
+    sigma_along=0.05, sigma_across=0.03, sigma_heading=0.03, floor_position=0.005, floor_heading=0.004
+)
 CAMERA = StereoCamera(mount=(0.2, 0.05, 0.4), sigma_px=1.0, sigma_disparity_px=0.5)
 STEPS, LANDMARKS = 31, 11
 
@@ -32,10 +34,8 @@ def driven(stereo: bool, robots: int = 1, every: int = 2, landmarks: int = LANDM
     angles = rng.uniform(0.0, 2.0 * np.pi, landmarks)
     world = np.column_stack([4.5 * np.cos(angles), 4.5 * np.sin(angles) + 2.0, rng.uniform(0.2, 1.4, landmarks)])
     starts = np.array([[0.0, 0.0, 0.0], [0.5, 0.4, 0.6], [-0.3, 0.2, -0.5]])[:robots]
-    slam = FastSlam(
-        robots, num_particles=7, motion=MOTION, camera=CAMERA, initial_poses=starts, seed=3, position_gate=1e3,
-        new_landmark_gate=1e5, **options,
-    )  # fmt: skip
+    options = {"motion": MOTION, "position_gate": 1e3, "new_landmark_gate": 1e5, **options}
+    slam = FastSlam(robots, num_particles=7, camera=CAMERA, initial_poses=starts, seed=3, **options)
     true = starts.copy()
     for step in range(STEPS):
         moves, frames, names = [], [], []
@@ -74,8 +74,8 @@ def residuals(graph: PoseGraph, poses: FloatArray, landmarks: FloatArray) -> Flo
     for (a, b), value, covariance in zip(*graph.motions, strict=True):
         error = between(value, between(poses[a], poses[b]))
         parts.append((error, covariance))
-    for (p, l), value, covariance in zip(*graph.sightings, strict=True):
-        parts.append((rotation(poses[p, 2]).T @ (landmarks[l] - poses[p, :2]) - value, covariance))
+    for (p, row), value, covariance in zip(*graph.sightings, strict=True):
+        parts.append((rotation(poses[p, 2]).T @ (landmarks[row] - poses[p, :2]) - value, covariance))
     for p, value, covariance in zip(*graph.pose_priors, strict=True):
         parts.append((between(value, poses[p]), covariance))
     errors = []
@@ -110,7 +110,8 @@ def optimised(graph: PoseGraph, steps: int = 3) -> tuple[FloatArray, FloatArray,
 def worst_shift(graph: PoseGraph, poses: FloatArray, landmarks: FloatArray) -> float:
     """Return the largest distance of estimates from those of the graph, in standard deviations of the graph."""
     free = ~graph.fixed
-    assert graph.pose_covariances is not None and graph.landmark_covariances is not None
+    assert graph.pose_covariances is not None
+    assert graph.landmark_covariances is not None
     off = poses - graph.poses
     off[:, 2] = wrap_angle(off[:, 2])
     sigmas = np.sqrt(np.diagonal(graph.pose_covariances[free], axis1=1, axis2=2))
@@ -138,12 +139,13 @@ def test_the_estimate_is_the_optimum_of_the_exported_graph(variant: dict[str, An
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_marginals_are_blocks_of_the_dense_inverse(variant: dict[str, Any]) -> None:
-    """Marginals equal those of the graph for a planar sensor, and are no larger for a stereo camera, whose heights count."""
+    """Marginals equal those of the graph for a planar sensor, and are no larger for a stereo camera, with heights."""
     graph = driven(**variant).graph()
     _, _, joint = optimised(graph, steps=1)
     free = np.flatnonzero(~graph.fixed)
     size = 3 * len(free)
-    assert graph.pose_covariances is not None and graph.landmark_covariances is not None
+    assert graph.pose_covariances is not None
+    assert graph.landmark_covariances is not None
     pairs = [(graph.pose_covariances[p], joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i, p in enumerate(free)]
     for i, marginal in enumerate(graph.landmark_covariances):
         at = slice(size + 2 * i, size + 2 * i + 2)
@@ -157,19 +159,12 @@ def test_marginals_are_blocks_of_the_dense_inverse(variant: dict[str, Any]) -> N
 
 
 def test_odometry_bias_is_taken_out_of_the_motions() -> None:
-    """With an estimated bias, the exported graph has its optimum at the estimate too, and larger marginals than its own."""
+    """With an estimated bias the optimum of the exported graph is the estimate, too; edges leave the bias out."""
     motion = OdometryModel(sigma_along=0.05, sigma_across=0.03, sigma_heading=0.03, bias_scale=0.1, bias_heading=0.05)
-    slam = FastSlam(num_particles=7, motion=motion, camera=CAMERA, seed=3)
-    rng = np.random.default_rng(2)
-    for step in range(STEPS):
-        at = np.array([[2.0, 0.3, 0.1]]) + 0.05 * rng.standard_normal((1, 3))
-        frame = Measurements(at @ ROBOT_FROM_CAMERA, np.ones((1, 1)), 0.01 * np.eye(3)[None])
-        slam.step([[0.2, 0.0, 0.3] if step else None], [frame], [[step % 9]])
-    graph = slam.graph()
-    poses, landmarks, joint = optimised(graph)
+    graph, plain = driven(stereo=False, motion=motion).graph(), driven(stereo=False).graph()
+    poses, landmarks, _ = optimised(graph)
     assert worst_shift(graph, poses, landmarks) < 1e-3
-    assert graph.pose_covariances is not None
-    assert np.linalg.eigvalsh(graph.pose_covariances[-1] - joint[3 * len(graph.poses) - 6 :, :][:3, 3 * len(graph.poses) - 6 :][:, :3]).min() > -1e-9
+    assert np.abs(graph.motions.values - plain.motions.values).max() > 1e-3
 
 
 def test_export_does_not_change_the_filter() -> None:
@@ -192,15 +187,15 @@ def test_path_of_each_robot_over_time() -> None:
         assert np.array_equal(path.poses, graph.poses[graph.robots == robot])
         timed = graph.trajectory(robot, 10.0 + 0.5 * np.arange(STEPS))
         assert np.array_equal(timed.times, 10.0 + 0.5 * path.times)
-    with pytest.raises(ValueError, match="step_times: expected at least 31 times, got 30. Give one for each step."):
+    with pytest.raises(ValueError, match=r"step_times: expected at least 31 times, got 30\. Give one for each step."):
         graph.trajectory(0, np.arange(30.0))
-    with pytest.raises(ValueError, match="robot: expected an index from 0 to 2, got 3."):
+    with pytest.raises(ValueError, match=r"robot: expected an index from 0 to 2, got 3\."):
         graph.trajectory(3)
 
 
 def test_smoothed_path_is_nearer_the_truth_than_odometry() -> None:
     """The smoothed end of a circle lies nearer the true end than chained odometry."""
-    slam = driven(stereo=True)
+    slam = driven(stereo=False, every=1)
     true = np.zeros(3)
     for _ in range(STEPS - 1):
         true = compose(true, [0.35, 0.0, 0.16])
@@ -233,7 +228,7 @@ def test_graphs_that_cannot_be_smoothed_are_refused() -> None:
     slam.step([None], [frame], poses=[[0.1, 0.0, 0.0]])
     with pytest.raises(ValueError, match="graph: expected odometry, got a pose that was given as exact"):
         slam.graph()
-    noiseless = {name: 0.0 for name in MOTION.__slots__}
+    noiseless = dict.fromkeys(MOTION.__slots__, 0.0)
     slam = FastSlam(num_particles=3, motion=OdometryModel(**noiseless))
     slam.step([[0.1, 0.0, 0.0]], [frame])
     with pytest.raises(ValueError, match="graph: expected odometry with noise, got no noise"):
@@ -242,7 +237,7 @@ def test_graphs_that_cannot_be_smoothed_are_refused() -> None:
 
 @pytest.mark.parametrize("stereo", [False, True])
 def test_gtsam_finds_the_same_optimum(stereo: bool, tmp_path: Path) -> None:
-    """GTSAM reads the poses and motions of the g2o file, and with the points as factors its optimum is the estimate."""
+    """GTSAM reads vertices and motions of the g2o file; with the points as factors its optimum is the estimate."""
     gtsam = pytest.importorskip("gtsam", reason="gtsam, an optional peer, is not installed: pip install gtsam")
     graph = driven(stereo, robots=2).graph()
     factors, values = gtsam.readG2o(str(write_graph(graph, tmp_path / "graph.g2o")), False)
@@ -253,7 +248,7 @@ def test_gtsam_finds_the_same_optimum(stereo: bool, tmp_path: Path) -> None:
         factors.add(gtsam.PriorFactorPose2(first + row, gtsam.Pose2(*graph.poses[row]), exact))
     for (pose, landmark), point, covariance in zip(*graph.sightings, strict=True):
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        key = gtsam.symbol("L", int(graph.landmark_ids[landmark]))
+        key = gtsam.symbol("l", int(graph.landmark_ids[landmark]))
 
         def error(this: Any, given: Any, jacobians: Any, measured: FloatArray = point) -> FloatArray:
             pose, place = given.atPose2(this.keys()[0]), given.atPoint2(this.keys()[1])
@@ -264,12 +259,9 @@ def test_gtsam_finds_the_same_optimum(stereo: bool, tmp_path: Path) -> None:
             return np.asarray(predicted - measured)
 
         factors.add(gtsam.CustomFactor(noise, [first + int(pose), key], error))
-    keys = [gtsam.symbol("L", int(i)) for i in graph.landmark_ids]
+    keys = [gtsam.symbol("l", int(i)) for i in graph.landmark_ids]
     for key, place in zip(keys, graph.landmarks, strict=True):
-        if values.exists(key):  # as VERTEX_XY of the file
-            np.testing.assert_array_equal(values.atPoint2(key), place)
-        else:
-            values.insert(key, place)
+        np.testing.assert_array_equal(values.atPoint2(key), place)
     optimum = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
     poses = np.array([[p.x(), p.y(), p.theta()] for p in map(optimum.atPose2, range(first, first + len(graph.poses)))])
     landmarks = np.array([optimum.atPoint2(key) for key in keys])

@@ -77,6 +77,11 @@ BAD: dict[str, dict[str, str]] = {
         "": "path: expected an archive (.npz) of KITTI features, ",
     },
     "replay stereo": {"--path none": "path: expected a folder with two stereo pairs (left_img_0.png, "},
+    "replay graph": {
+        "": "path: expected a value, got 'none'. Give --path.",
+        "--path none.txt": "path: expected a pose graph (.g2o, .pyfg, .fg), got ",
+        "--path none.g2o": "path: expected a pose graph (g2o), got ",
+    },
     "replay MODULE:FUNCTION": {
         "": "path: expected a value, got 'none'. Give --path.",
         "--path .": "reader: expected MODULE:NAME of a reader, got ",

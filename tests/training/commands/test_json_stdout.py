@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 import typer.main
-from small_logs import write_drive, write_log, write_park
+from small_logs import small_graph, write_drive, write_log, write_park
 
+from slam_backend.readers.pose_graphs import write_graph
 from training import cli
 
 SEED = ("--first-seed", "100")
@@ -23,6 +24,7 @@ LEAST = {
     "replay mrclam": ("--path", "robots", "--duration", "5", "--particles", "3"),
     "replay victoria": ("--path", "park", "--duration", "6", "--particles", "3"),
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
+    "replay graph": ("--path", "graph.g2o", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
     "bench speed filter": (
         "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
@@ -64,6 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_log(made / "robots", noise=1.0)
     write_park(made / "park")
     write_drive(made / "drive")
+    write_graph(small_graph()[0], made / "graph.g2o")
     return made
 
 

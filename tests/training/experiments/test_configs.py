@@ -44,7 +44,7 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     paper.Fig6Config: {"regimes": ("good",)}, replay.ImagesConfig: {"path": "images", "descriptor": "orb"},
     replay.KittiConfig: {"path": "drive", "truth": "poses.txt"},
     replay.MrclamConfig: {"path": "log", "robots": (1, 4), "motion": {"sigma_along": 0.125}},
-    replay.LogConfig: {"path": "log", "particles": 7},
+    replay.LogConfig: {"path": "log", "particles": 7}, replay.GraphConfig: {"path": "a.g2o", "truth": "b.g2o"},
     replay.VictoriaConfig: {"path": "log", "sensor": {"range": 0.25}}, RunConfig: {"world": "maze", "max_cycles": 12},
 }  # fmt: skip
 KINDS = [pytest.param(kind, id=kind.__name__) for kind in CASES]
@@ -123,7 +123,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "estimator": {"ekf": "one of 'fastslam2', 'fastslam1'"}, "particles": {0: AT_LEAST_1},
         "drive": {3: "a table of delay, speed, turn"}, "duration": {float("nan"): ABOVE_0},
     },
-    replay.LogConfig: {"particles": {0: AT_LEAST_1}},
+    replay.LogConfig: {"particles": {0: AT_LEAST_1}}, replay.GraphConfig: {"particles": {0: AT_LEAST_1}},
     replay.VictoriaConfig: {"particles": {True: AT_LEAST_1, 2.5: AT_LEAST_1}},
     RunConfig: {
         "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
