@@ -123,7 +123,14 @@ class PoseGraph:
         return int(self.robots.max(initial=-1)) + 1
 
     def names(self) -> tuple[list[str], list[str]]:
-        """Return the names of the poses and of the landmarks, with a letter for each robot: `A0`, `B0`, `L0`."""
+        """Return the names of the poses and of the landmarks, with a letter for each robot: `A0`, `B0`, `L0`.
+
+        Raises:
+            ValueError: If there are more than 25 robots.
+        """
+        if self.num_robots > len(LETTERS):
+            hint = "More have no letters: use g2o, which has none."
+            raise argument_error("graph", f"at most {len(LETTERS)} robots", self.num_robots, hint)
         poses = [f"{LETTERS[r]}{i}" for r, i in zip(self.robots.tolist(), self.pose_ids.tolist(), strict=True)]
         return poses, [f"L{i}" for i in self.landmark_ids.tolist()]
 

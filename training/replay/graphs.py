@@ -11,7 +11,7 @@ from slam_backend.geometry import inverse
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.pose_graph import PoseGraph, rotated
+from slam_backend.pose_graph import LETTERS, PoseGraph, rotated
 from slam_backend.readers.pose_graphs import read_graph
 from slam_backend.trajectory import Trajectory
 from training.replay.log import Log, RobotLog
@@ -33,6 +33,9 @@ def read_graph_log(path: str | Path, *, truth: str | None = None) -> Log:
     if not len(graph.sightings.rows):
         hint = "The filter maps landmarks: an optimiser is what suits a graph without them."
         raise argument_error("path", "a graph with sightings of landmarks", "a graph without any", hint)
+    if graph.num_robots > len(LETTERS):
+        hint = "A robot ends where no EDGE_SE2 links successive poses: join its parts, or drop some robots."
+        raise argument_error("path", f"a graph of at most {len(LETTERS)} robots", graph.num_robots, hint)
     true = None if truth is None else read_graph(truth, "truth")
     rows = [np.flatnonzero(graph.robots == robot) for robot in np.unique(graph.robots)]
     names, landmark_names = graph.names()

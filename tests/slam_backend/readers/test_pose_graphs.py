@@ -214,8 +214,12 @@ def test_bad_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         read_graph(tmp_path / "a.g2o")
     with open(tmp_path / "b.pyfg", "wb") as large:
         large.truncate((MOST_MEGABYTES << 20) + 1)
-    with pytest.raises(ValueError, match=r"expected a pose graph \(pyfg\) of at most 256 MiB"):
+    with pytest.raises(ValueError, match=r"expected a pose graph \(pyfg\) of at most 64 MiB"):
         read_graph(tmp_path / "b.pyfg")
+    many = PoseGraph(poses=np.zeros((26, 3)), robots=np.arange(26))
+    assert read_graph(write_graph(many, tmp_path / "many.g2o")).num_robots == 26
+    with pytest.raises(ValueError, match="graph: expected at most 25 robots, got 26"):
+        write_graph(many, tmp_path / "many.pyfg")
     with pytest.raises(ValueError, match="graph: expected a PoseGraph, got 3"):
         write_graph(3, tmp_path / "c.g2o")  # type: ignore[arg-type]
 

@@ -124,7 +124,7 @@ def test_what_is_not_used_is_counted(tmp_path: Path) -> None:
 
 
 def test_graphs_that_cannot_be_replayed_are_refused(tmp_path: Path) -> None:
-    """A graph without sightings, a gap in the odometry and a truth without a vertex are refused with a cure."""
+    """A graph without sightings, gaps in the odometry and a truth without a vertex are refused with a cure."""
     graph, true = small_graph()
     write_graph(changed(graph, sightings=Factors.none(2)), tmp_path / "a.g2o")
     with pytest.raises(
@@ -135,6 +135,11 @@ def test_graphs_that_cannot_be_replayed_are_refused(tmp_path: Path) -> None:
     write_graph(changed(graph, motions=gap), tmp_path / "b.pyfg")
     with pytest.raises(ValueError, match="path: expected an odometry edge between A6 and A7, successive poses, got no"):
         read_graph_log(tmp_path / "b.pyfg")
+    longer, _ = small_graph(steps=60)
+    torn = changed(longer, motions=Factors(*(column[1::2] for column in longer.motions)))
+    write_graph(torn, tmp_path / "torn.g2o")
+    with pytest.raises(ValueError, match="path: expected a graph of at most 25 robots, got 31"):
+        read_graph_log(tmp_path / "torn.g2o")
     few = PoseGraph(poses=true.poses, landmarks=true.landmarks[:5], landmark_ids=true.landmark_ids[:5])
     write_graph(graph, tmp_path / "c.pyfg")
     write_graph(few, tmp_path / "few.pyfg")
