@@ -21,6 +21,7 @@ from training.replay.config import (
     PAIRS,
     VICTORIA,
     BagConfig,
+    GraphConfig,
     ImagesConfig,
     KittiConfig,
     LogConfig,
@@ -148,6 +149,15 @@ def _list_topics(console: Console, path: str) -> None:
     for topic, kind, count, use in bag_topics(path):
         table.add_row(topic, kind or "several", str(count), use or "-")
     console.print(table)
+
+
+@replay.command("graph")
+@options(GraphConfig, "replay graph")
+def replay_graph(call: Call[GraphConfig]) -> None:
+    """Replay a pose graph of g2o or PyFactorGraph with landmarks: its odometry and sightings, identities given."""
+    from training.replay.graphs import read_graph_log
+
+    _replay(call, call.config, read_graph_log)
 
 
 @replay.command(OWN)

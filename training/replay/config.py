@@ -179,6 +179,13 @@ class BagConfig(ReplayConfig):
     sensor: SightingNoise = setting(BAG_SENSOR, "Assumed noise of landmarks without covariance.")
 
 
+class GraphConfig(ReplayConfig):
+    """Replay of a pose graph with landmarks; the odometry noise is fitted to its edges."""
+
+    path: str = option(..., "Pose graph: .g2o, .pyfg or .fg.", hint="Give --path.", is_path=True)
+    truth: str | None = option(None, "Pose graph whose vertices are true.", shown="none", is_path=True)
+
+
 class LogConfig(ReplayConfig):
     """Replay of a log by a reader of the user; what is not given is as in the log, or else as for other logs."""
 

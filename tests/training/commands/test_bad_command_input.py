@@ -86,6 +86,11 @@ BAD: dict[str, dict[str, str]] = {
         "--path . --dt 0": "dt: expected a finite number > 0, got 0.0. Give seconds, near those between two frames.",
         "--path . --odometry /odom,/odom": "odometry: expected at least one value, each once, got ",
     },
+    "replay graph": {
+        "": "path: expected a value, got 'none'. Give --path.",
+        "--path none.txt": "path: expected a pose graph (.g2o, .pyfg, .fg), got ",
+        "--path none.g2o": "path: expected a pose graph (g2o), got ",
+    },
     "replay MODULE:FUNCTION": {
         "": "path: expected a value, got 'none'. Give --path.",
         "--path .": "reader: expected MODULE:NAME of a reader, got ",

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 import typer.main
 from builders.bags import write_circle
-from small_logs import write_drive, write_log, write_park
+from small_logs import small_graph, write_drive, write_log, write_park
 
+from slam_backend.readers.pose_graphs import write_graph
 from training import cli
 
 SEED = ("--first-seed", "100")
@@ -24,6 +25,7 @@ LEAST = {
     "replay mrclam": ("--path", "robots", "--duration", "5", "--particles", "3"),
     "replay victoria": ("--path", "park", "--duration", "6", "--particles", "3"),
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
+    "replay graph": ("--path", "graph.g2o", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
     "replay bag": (
         "--path", "circle.mcap", "--odometry", "/odom", "--landmarks", "/tags", "--duration", "3", "--particles", "3",
@@ -69,6 +71,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_park(made / "park")
     write_drive(made / "drive")
     write_circle(made / "circle.mcap", seconds=5.0)
+    write_graph(small_graph()[0], made / "graph.g2o")
     return made
 
 

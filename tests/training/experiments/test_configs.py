@@ -44,7 +44,7 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     paper.Fig6Config: {"regimes": ("good",)}, replay.ImagesConfig: {"path": "images", "descriptor": "orb"},
     replay.KittiConfig: {"path": "drive", "truth": "poses.txt"},
     replay.MrclamConfig: {"path": "log", "robots": (1, 4), "motion": {"sigma_along": 0.125}},
-    replay.LogConfig: {"path": "log", "particles": 7},
+    replay.LogConfig: {"path": "log", "particles": 7}, replay.GraphConfig: {"path": "a.g2o", "truth": "b.g2o"},
     replay.BagConfig: {"path": "log.bag", "odometry": ("/odom",), "sensor": {"height": 0.125}},
     replay.VictoriaConfig: {"path": "log", "sensor": {"range": 0.25}}, RunConfig: {"world": "maze", "max_cycles": 12},
 }  # fmt: skip
@@ -129,6 +129,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "dt": {0.0: ABOVE_0}, "odometry": {(): "at least one value, each once"}, "particles": {0: AT_LEAST_1},
         "alone": {"yes": "a bool"},
     },
+    replay.LogConfig: {"particles": {0: AT_LEAST_1}}, replay.GraphConfig: {"particles": {0: AT_LEAST_1}},
     replay.VictoriaConfig: {"particles": {True: AT_LEAST_1, 2.5: AT_LEAST_1}},
     RunConfig: {
         "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
