@@ -21,9 +21,9 @@ def card(folder: RunFolder, rows: Sequence[Mapping[str, Any]], fields: Mapping[s
     """Return the text of a data set's card.
 
     Args:
-        folder: Its folder.
-        rows: Its episodes, see `training.dataset.recording.play`.
-        fields: Its arrays.
+        folder: Folder of the data set.
+        rows: Rows of the episodes, see `training.dataset.recording.play`.
+        fields: Arrays of a file by name.
         digest: Digest of all files.
     """
     config, robots = folder.config, fields["rewards"].shape[0]

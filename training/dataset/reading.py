@@ -28,7 +28,7 @@ class RecordedEpisode:
     """One episode of K robots and T steps.
 
     Attributes:
-        number: Its number in the data set.
+        number: Number of the episode in the data set.
         seed: Seed of world, noise and policy.
         observations: (K, T + 1, ...) by key; the first of a robot is that of the reset.
         actions: (K, T) int64, or (K, T, 2) float32 for continuous ones.
@@ -140,9 +140,9 @@ def read_episode(folder: Path, description: Description, row: Mapping[str, Any])
         return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
     return RecordedEpisode(
-        row["episode"], row["seed"], below(OBSERVATIONS),
-        *(arrays[name] for name in ("actions", "rewards", "terminations", "truncations", "times")),
-        below("estimates/"), below("truth/"),
+        number=row["episode"], seed=row["seed"], observations=below(OBSERVATIONS), actions=arrays["actions"],
+        rewards=arrays["rewards"], terminations=arrays["terminations"], truncations=arrays["truncations"],
+        times=arrays["times"], estimates=below("estimates/"), truth=below("truth/"),
     )  # fmt: skip
 
 
@@ -206,7 +206,7 @@ def to_minari(folder: str | Path, dataset_id: str, **about: Any) -> Any:
         hint = f"Install it: pip install 'minari[hdf5,arrow]'. Python says: {error}."
         raise argument_error("minari", "the package minari", "no such package", hint) from error
     description = read_description(folder)
-    observed = {
+    observed: dict[str, spaces.Space[Any]] = {
         name.removeprefix(OBSERVATIONS): _box(field)
         for name, field in description.fields.items() if name.startswith(OBSERVATIONS)
     }  # fmt: skip

@@ -58,7 +58,7 @@ class Field(NamedTuple):
         shape: Lengths of its axes; words for those that depend on the episode: `times` is one more than `steps`.
         dtype: Type of its numbers.
         unit: Unit, or units of the columns.
-        meaning: What it holds.
+        meaning: Content in words.
         low: Lower bound, or bounds of an entry, of a space; None: no space.
         high: Upper bound, or bounds.
     """
@@ -132,7 +132,7 @@ def check_room(config: RecordConfig, env: ExplorationEnv, out: Path | None) -> s
 
     Args:
         config: Configuration of the data set.
-        env: Its environment.
+        env: Environment of its episodes.
         out: Folder of the data set, which may exist; None: a folder in `runs`.
 
     Returns:

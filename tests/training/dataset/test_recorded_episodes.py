@@ -304,7 +304,7 @@ def test_minari_reads_what_was_recorded(
     minari = pytest.importorskip("minari", reason="Minari is not installed: pip install 'minari[hdf5,arrow]'")
     pytest.importorskip({"arrow": "pyarrow", "hdf5": "h5py"}[data_format], reason="Minari's format is not installed")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    to_minari(recorded, "vslam/fig5/frontier-v0", data_format=data_format, author="nobody in particular")
+    to_minari(recorded, "vslam/fig5/frontier-v0", data_format=data_format, author="an engineer")
     found = minari.load_dataset("vslam/fig5/frontier-v0")
     assert (found.total_episodes, found.total_steps) == (EPISODES * ROBOTS, EPISODES * ROBOTS * STEPS)
     assert found.action_space.n == 33

@@ -79,8 +79,8 @@ def save_ros_map(grid: OccupancyGrid, path: str | Path) -> None:
     pixels = np.full(cells.shape, UNKNOWN, np.uint8)
     for state, level in LEVELS.items():
         pixels[cells == state] = level
-    height, width = pixels.shape
-    x, y = (centre_of([top, left], len(grid.cells)) - 0.5 * CELL).round(9).tolist()
+    height, width = bottom - top, right - left
+    x, y = map(float, (centre_of([top, left], len(grid.cells)) - 0.5 * CELL).round(9))
     image = path.with_suffix(".pgm")
     write_file(image, f"P5\n{width} {height}\n255\n".encode() + pixels[::-1].tobytes())  # rows from the top
     write_file(
