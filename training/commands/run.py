@@ -101,8 +101,10 @@ def run(
             ("estimate", record.estimated), ("dead_reckoning", record.reckoned), ("truth", record.true_poses)
         ):  # fmt: skip
             folder.write_trajectory(f"robot{robot}_{kind}", Trajectory(record.times, paths[robot]))
+    agents = env.possible_agents
     maps = {"-".join(map(str, group)): record.maps[group[0]] for group in record.groups}
-    console.print(write_maps(folder, maps), soft_wrap=True)
+    grids = {"-".join(map(str, group)): env.belief(agents[group[0]]).grid for group in record.groups}
+    console.print(write_maps(folder, maps, grids), soft_wrap=True)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
     recording.save(folder.path)

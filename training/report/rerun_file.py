@@ -45,7 +45,7 @@ def write_rerun(recording: Recording, file: Path) -> Path:
     import rerun
 
     stream = rerun.RecordingStream("vslam_env")
-    stream.save(file)
+    stream.save(file, default_blueprint=_layout())
     if len(recording.walls):
         walls = _picture(recording.walls.reshape(-1, 2, 2))
         stream.log("world/walls", rerun.LineStrips2D(walls, radii=LINE, colors=[GREY]), static=True)
@@ -71,6 +71,20 @@ def write_rerun(recording: Recording, file: Path) -> Path:
     stream.flush()
     stream.disconnect()
     return file
+
+
+def _layout() -> Any:
+    """Return the views with which the viewer opens: the world, beside it scores and events."""
+    from rerun import blueprint
+
+    charts = {"map error E [m]": "map_error", "position error [m]": "pose_error", "coverage": "coverage"}
+    beside = [
+        blueprint.TimeSeriesView(origin=f"scores/{metric}", name=title) for title, metric in charts.items()
+    ] + [blueprint.TextLogView(origin="events", name="merges")]  # fmt: skip
+    world = blueprint.Spatial2DView(contents=["world/**", "robots/**"], name="world")
+    return blueprint.Blueprint(
+        blueprint.Horizontal(world, blueprint.Vertical(*beside), column_shares=[3, 2]), collapse_panels=True
+    )
 
 
 def _picture(points: Array) -> Array:

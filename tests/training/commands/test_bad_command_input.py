@@ -26,6 +26,14 @@ BAD: dict[str, dict[str, str]] = {
         "--world fig5 --out full": "out: expected a new or empty folder",
         "--world fig5 --out /proc/version/run": "out: expected a folder that can be written",
     },
+    "record": {
+        "--episodes 0": "episodes: expected an int >= 1, got 0. Record at least one episode.",
+        "--observations some": "observations: expected one of 'driver', 'goal', 'all', got 'some'.",
+        "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
+        "--world fig5 --out full": "out: expected a new or empty folder",
+        "--workers 0": "workers: expected an int >= 1, got 0.",
+        "--verify full": "verify: expected the config.toml of an earlier run, got no such file.",
+    },
     "train": {
         "--robots 9": f"{ROBOTS} 9.",
         "--world castle": "world: expected one of 'office'",

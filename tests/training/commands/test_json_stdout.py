@@ -20,6 +20,9 @@ SEED = ("--first-seed", "100")
 # Minimal arguments of each command with --json, in a folder with logs and a model.
 LEAST = {
     "run": ("--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--no-video"),
+    "record": (
+        "--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--episodes", "2", *SEED,
+    ),
     "train": ("--preset", "smoke", "--robots", "1", "--workers", "0", "--steps", "24"),
     "evaluate": ("trained", "--seeds", "2", "--policies", "random_goals", *SEED),
     "replay mrclam": ("--path", "robots", "--duration", "5", "--particles", "3"),
