@@ -154,7 +154,7 @@ class Plan(Checked):
         self, policies: Sequence[str] | None = None, tracks: Sequence[str] | None = None, extent: str = ALL,
         with_missing: bool = False,
     ) -> list[PlanTrial]:  # fmt: skip
-        """Return all episodes: the base parts of the tracks, the rest of them, and those with limits relaxed.
+        """Return all episodes: base parts of the tracks, then for each track those with limits relaxed, and the rest.
 
         Args:
             policies: Labels of the policies; None: those of the plan.
@@ -175,13 +175,14 @@ class Plan(Checked):
         if extent == BASE:
             return found
         plans = range(len(self.floor_plans) if with_missing or not self.missing_floor_plans() else 0)
+        relaxations = [*self.all_relaxations][1:] if self.relaxed_policy in players else []
         for name in names:
             track = self.all_tracks[name]
-            found += self._of_track(name, players, range(track.base, track.seeds), plans)
-        if self.relaxed_policy is not None and self.relaxed_policy in players:
-            for name, relaxation in product(names, [*self.all_relaxations][1:]):
-                seeds = range(self.all_tracks[name].relaxed)
-                found += self._of_track(name, [self.relaxed_policy], seeds, relaxation=relaxation)
+            compared = max(track.base, track.relaxed)
+            found += self._of_track(name, players, range(track.base, compared))
+            for relaxation in relaxations:
+                found += self._of_track(name, [str(self.relaxed_policy)], range(track.relaxed), relaxation=relaxation)
+            found += self._of_track(name, players, range(compared, track.seeds), plans)
         return found
 
     def _of_track(
