@@ -200,8 +200,8 @@ class Inbox:
         self.maps: dict[str, SharedMap] = {}
         self._parts: dict[str, dict[int, Part]] = {}  # of the newest map of each robot, by number of the part
 
-    def add(self, part: Part) -> str | None:
-        """Add a part; return why it is refused, if it is."""
+    def add(self, part: Part, descriptor_size: int = 0) -> str | None:
+        """Add a part; return why it is refused, if it is: maps need descriptors of this length, if it is not 0."""
         known = {*self.maps, *self._parts}
         if part.robot not in known and len(known) >= MOST_PEERS:
             return f"expected at most {MOST_PEERS} robots, got one more, {part.robot!r}"
@@ -222,9 +222,15 @@ class Inbox:
         if len(waiting) < part.parts:
             return None
         del self._parts[part.robot]
-        return self._complete([waiting[k] for k in range(part.parts)])
+        return self._complete([waiting[k] for k in range(part.parts)], descriptor_size)
 
-    def _complete(self, parts: Sequence[Part]) -> str | None:
+    def keep(self, descriptor_size: int) -> None:
+        """Drop maps with descriptors of another length, received before the own length was known."""
+        lengths = {name: shared.descriptors.shape[1] for name, shared in self.maps.items() if len(shared.ids)}
+        for name in [name for name, length in lengths.items() if length != descriptor_size]:
+            del self.maps[name]
+
+    def _complete(self, parts: Sequence[Part], descriptor_size: int) -> str | None:
         """Read a map of which all parts are there."""
         first = parts[0]
         try:
@@ -233,5 +239,10 @@ class Inbox:
             return str(error)
         if (shared.robot, shared.life, shared.number) != (first.robot, first.life, first.number):
             return f"expected a map of {first.robot!r}, got one of {shared.robot!r}"
+        length = shared.descriptors.shape[1]
+        if descriptor_size and len(shared.ids) and length != descriptor_size:
+            return (
+                f"expected descriptors of length {descriptor_size}, got {length} of {first.robot!r}: use one front end"
+            )
         self.maps[first.robot] = shared
         return None

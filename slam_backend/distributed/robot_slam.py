@@ -171,7 +171,7 @@ class RobotSlam:
         elif part.robot == self.name:
             why = None if part.life <= self.life else f"expected one robot named {self.name!r}, got two: rename one"
         else:
-            why = self._inbox.add(part)
+            why = self._inbox.add(part, self.filter.descriptor_size)
         self.refused += why is not None
         return why
 
@@ -180,12 +180,13 @@ class RobotSlam:
     def attempt(self) -> LinkEvent | None:
         """Align the published map with that of the robot whose last attempt is longest ago, if either is newer."""
         own, maps = self._own, self._inbox.maps
-        if own is None:
+        if own is None or not len(own.ids):
             return None
+        self._inbox.keep(own.descriptors.shape[1])
         waiting = {
             name: self._tried.get(name, NEVER)
             for name, shared in maps.items()
-            if self._tried.get(name, NEVER)[1:] != (own.number, shared.life, shared.number)
+            if len(shared.ids) and self._tried.get(name, NEVER)[1:] != (own.number, shared.life, shared.number)
         }
         if not waiting:
             return None
@@ -290,7 +291,7 @@ class RobotSlam:
         """
         fused = self.filter.map(min_count=min_count)
         for name, (motion, covariance) in self._tree().items():
-            if name != self.name:
+            if name != self.name and len(self._inbox.maps[name].ids):
                 landmarks = self._inbox.maps[name].landmarks()
                 fused = fuse_maps(fused, landmarks, _known(fused, landmarks, motion, covariance, self._alignment))
         return fused

@@ -13,6 +13,7 @@ from slam_backend.core.validation import FloatArray
 from slam_backend.distributed import RobotSlam
 from slam_backend.distributed import messages as m
 from slam_backend.geometry import compose, inverse
+from slam_backend.models.measurements import Measurements
 from slam_backend.state.codec import encode
 from slam_backend.state.format import equal
 
@@ -250,6 +251,22 @@ def test_a_team_has_at_most_so_many_robots() -> None:
     answers = [robot.receive(m._sealed(m.Part(f"r{k}", 1, 1, 0, 2, b""), key)) for k in range(m.MOST_PEERS + 1)]
     assert answers[:-1] == [None] * m.MOST_PEERS
     assert answers[-1] == "expected at most 32 robots, got one more, 'r32'"
+
+
+def test_maps_with_other_descriptors_are_refused(met: Any) -> None:
+    """A map of another front end is refused in one line; one that came before the own first landmark is dropped."""
+    frames = [Measurements([[0.0, 0.0, 2.0]], [[1.0] + [0.0] * (d - 1)]) for d in (2, 3)]
+    two, three = (RobotSlam(name, num_particles=5, min_count=1) for name in ("two", "three"))
+    three.step(None, frames[1])
+    three.share()
+    (message,) = three.outbox()
+    assert two.receive(message) is None  # nothing is known of its own yet
+    two.step(None, frames[0])
+    two.share()
+    assert two.attempt() is None
+    assert not two._inbox.maps
+    assert two.receive(message) == "expected descriptors of length 2, got 3 of 'three': use one front end"
+    assert two.group == ("two",)
 
 
 def test_a_link_that_later_maps_contradict_is_undone(met: Any) -> None:
