@@ -106,7 +106,7 @@ class ExploreNode(Node):
 
     def _decide(self) -> None:
         """Publish the candidates, and the goal if it is another one."""
-        if self._map_from_start is None or self._known is None:
+        if self._map_from_start is None or self._known is None or not self._known.values.any():
             return
         self.team.keeps_candidates = False  # so that they are found now
         belief, now = self.team.belief(0), self.get_clock().now()

@@ -65,7 +65,7 @@ class Ros:
         now: Time [s].
         transform: Answer of TF; None: there is none.
         published: Messages by topic.
-        lose: Function of a topic that says whether its next message is lost.
+        callbacks: Subscribers by topic.
     """
 
     def __init__(self) -> None:

@@ -1,5 +1,6 @@
 """Nodes of `examples/ros2` on a stub of rclpy: driven by the readings of simulated robots, and by bad messages."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -277,8 +278,8 @@ def test_bad_messages_are_refused_in_one_line_and_change_nothing(stub: Any, driv
         assert "\n" not in node.lines[-1]
     np.testing.assert_array_equal(node.team.poses[0], before[0])
     np.testing.assert_array_equal(node.team.grid(0).cells, before[1])
-    world.publish("/landmark_points", cloud_at(scripts.conversions, 13.0, broken))
-    world.publish("/odom", odometry_at(13.1, compose(pose, [0.3, 0.0, 0.0])))
+    world.publish("/landmark_points", cloud_at(scripts.conversions, 13.1, broken))
+    world.publish("/odom", odometry_at(13.2, compose(pose, [0.3, 0.0, 0.0])))
     assert "descriptors" in node.lines[-1]
     assert node.team.belief(0).tick == len(ticks)  # the motion counts, without these landmarks
     world.publish("/landmark_points", cloud)
@@ -287,7 +288,7 @@ def test_bad_messages_are_refused_in_one_line_and_change_nothing(stub: Any, driv
 
 
 def test_a_map_without_floor_has_no_goals(stub: Any, drive: Any) -> None:
-    """On a map that is empty or unknown, as SLAM nodes publish at first, no goal is published, and the node says so once."""
+    """An empty or unknown map, as SLAM nodes publish it at first, is awaited in silence, without a goal."""
     (world, scripts), (ticks, _) = stub, drive
     world.parameters = EXPLORER | {"policy": "frontier"}
     node = scripts.explore_node.ExploreNode()
@@ -298,7 +299,36 @@ def test_a_map_without_floor_has_no_goals(stub: Any, drive: Any) -> None:
         world.publish("/map", empty)
         node.timers[0]()
     assert "/goal_pose" not in world.published
-    assert node.lines == ["nothing left to go to"]
+    assert node.lines == []
+
+
+def test_a_policy_of_ones_own_that_fails_is_a_warning(
+    stub: Any, drive: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A policy from a module is found in the current folder; if it raises or chooses no candidate, the node goes on."""
+    (world, scripts), (ticks, belief) = stub, drive
+    lines = ("class Wrong:", "    def reset(self): pass", "    def act(self, observation, belief, rng):")
+    faults = {"raises_here": "raise KeyError('no plan')", "chooses_none": "return 99", "stays": "return 0"}
+    monkeypatch.chdir(tmp_path)
+    said = []
+    for name, fault in faults.items():
+        (tmp_path / f"{name}.py").write_text("\n".join([*lines, f"        {fault}"]), encoding="utf-8")
+        world.callbacks.clear()
+        world.parameters = EXPLORER | {"policy": f"{name}:Wrong"}
+        node = scripts.explore_node.ExploreNode()
+        world.publish("/map", map_of(belief.grid))
+        play(world, scripts.conversions, ticks[:4])
+        for _ in range(2):
+            node.timers[0]()
+        monkeypatch.delitem(sys.modules, name)
+        said += node.lines
+    assert "/goal_pose" not in world.published
+    assert [line.partition(", got")[0] for line in said] == [
+        "policy 'raises_here:Wrong': expected it to be imported and made",
+        "policy: expected 0 or 1 + the slot of a candidate",
+        "nothing left to go to",
+    ]
+    assert "KeyError: 'no plan' (raises_here.py, line 4)" in said[0]
 
 
 def test_bad_parameters_end_a_node_with_one_line(stub: Any, tmp_path: Path) -> None:
