@@ -367,12 +367,13 @@ def listen(
 def run(make: Callable[[], Any]) -> None:
     """Make a node and let it work until it is stopped; parameters that do not fit end it with one line."""
     import rclpy
+    from rclpy.exceptions import ParameterException
     from rclpy.executors import ExternalShutdownException
 
     rclpy.init()
     try:
         node = make()
-    except ValueError as error:
+    except (ValueError, ParameterException) as error:
         rclpy.try_shutdown()
         sys.exit(f"error {error}")
     try:

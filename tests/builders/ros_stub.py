@@ -53,6 +53,10 @@ Trigger = SimpleNamespace(Request=_message(), Response=_message(success=bool, me
 TransformStamped = _message(transform=_message(translation=Point, rotation=Quaternion))
 
 
+class ParameterException(Exception):
+    """Parameter of another type than its default."""
+
+
 class TransformException(Exception):
     """Missing transform."""
 
@@ -96,7 +100,8 @@ def _node_class(world: Ros) -> type:
 
         def declare_parameter(self, name: str, default: Any) -> Any:
             value = self.given.get(name, default)
-            assert type(value) is type(default), f"{name}: InvalidParameterTypeException"
+            if type(value) is not type(default):
+                raise ParameterException(f"Trying to set parameter {name!r} to {value!r}, expecting another type")
             self.values[name] = value
             return SimpleNamespace(value=value)
 
@@ -158,6 +163,7 @@ def ros_stub() -> Iterator[tuple[Ros, SimpleNamespace]]:
 
     modules = {
         "rclpy": {"init": lambda: None, "spin": stopped, "try_shutdown": lambda: None},
+        "rclpy.exceptions": {"ParameterException": ParameterException},
         "rclpy.executors": {"ExternalShutdownException": type("ExternalShutdownException", (Exception,), {})},
         "rclpy.node": {"Node": _node_class(world)},
         "rclpy.qos": {

@@ -339,6 +339,7 @@ def test_bad_parameters_end_a_node_with_one_line(stub: Any, tmp_path: Path) -> N
     for node, given, text in (
         (scripts.explore_node.ExploreNode, {"policy": "frontie"}, "error policy: expected one of "),
         (scripts.explore_node.ExploreNode, {"policy": "no_such_module:Policy"}, "error policy: expected MODULE:NAME"),
+        (scripts.explore_node.ExploreNode, {"period": 2}, "error Trying to set parameter 'period' to 2, expecting"),
         (scripts.explore_node.ExploreNode, {"period": 0.0}, "error period: expected a finite number > 0"),
         (scripts.explore_node.ExploreNode, {"wait": -1.0}, "error wait: expected a finite number > 0"),
         (scripts.explore_node.ExploreNode, {"sigma": -1.0}, "error sigma: expected a finite number >= 0"),
