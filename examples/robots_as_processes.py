@@ -43,13 +43,13 @@ Steps = list[tuple[FloatArray | None, Measurements | None]]
 class Recorded(NamedTuple):
     """Readings of a team, step by step, and what is known of the world."""
 
-    steps: Sequence[Steps]  # of each robot
-    seconds: float  # of a step
-    options: Mapping[str, Any]  # of filters
-    alignment: Any  # options of alignments
+    steps: Sequence[Steps]  # Readings of each robot
+    seconds: float  # Duration of a step [s]
+    options: Mapping[str, Any]  # Options of filters
+    alignment: Any  # Options of alignments
     landmarks: FloatArray  # (N, 2) true landmarks
     starts: FloatArray  # (K, 3) true start poses
-    attempts: AttemptOptions  # of `TeamSlam`
+    attempts: AttemptOptions  # Schedule of `TeamSlam`
 
 
 def record_episode(robots: int, world: str, seconds: float, seed: int) -> Recorded:
@@ -123,7 +123,7 @@ def run_robot(
 
 
 def free_ports(count: int) -> list[int]:
-    """Return ports of this machine that nobody uses."""
+    """Return ports of this machine that are free."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     for each in sockets:
         each.bind(("127.0.0.1", 0))

@@ -22,6 +22,7 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
+from slam_backend.pose_graph import PoseGraph
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
@@ -47,6 +48,7 @@ __all__ = [
     "MergeOptions",
     "OdometryModel",
     "PoseEstimate",
+    "PoseGraph",
     "RejuvenationReport",
     "Relocalisation",
     "SmoothingOptions",

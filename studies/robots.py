@@ -69,7 +69,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
 
     Returns:
         `map_error` of the maps that robots hold at the end, `team_map_error` of `TeamSlam`, `more`: their difference;
-        `alone_map_error` of filters that hear nobody; `recall`, `team_recall`; `held`, `team_held`: robots in the group
+        `alone_map_error` of filters alone; `recall`, `team_recall`; `held`, `team_held`: robots in the group
         of a robot; `false_links`: links at the end that are off by half a metre or 5 degrees; `undone`; bytes a second
         of a robot: `maps_bytes`, `inputs_bytes` of all its readings, `team_bytes` as `TeamSlam` counts them.
 

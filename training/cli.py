@@ -40,6 +40,10 @@ COMMANDS = {
         "evaluate", "evaluate",
         "Compare a model with baseline policies on the same unseen worlds, with confidence intervals.",
     ),
+    "record": (
+        "record", "record",
+        "Record episodes as a data set: observations, actions, rewards, ends and the truth, with a card and digests.",
+    ),
     "report": (
         "report", "report",
         "Write report.html into a run folder: playback of the episode, curves and tables, in one file for any browser.",

@@ -2,8 +2,8 @@
 
 A robot runs a filter of its own and publishes its map at intervals. It aligns its map with those it has received
 (Sec. 3.1); a success is a *link*, the motion between two start frames, which it publishes, too. Robots that links
-connect form a group; each of them places and fuses the maps of its group by the same links. Nothing waits for anybody:
-a robot that falls silent leaves its last map, and a link that later maps contradict is undone.
+connect form a group; each of them places and fuses the maps of its group by the same links. Nothing waits: a robot that
+falls silent leaves its last map, and a link that later maps contradict is undone.
 """
 
 import hashlib

@@ -65,8 +65,10 @@ from slam_backend.fastslam.step_input import MAX_POSE, RobotRows, StepInput, row
 from slam_backend.geometry import between, compose, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, MapSummary, MapSummaryRows, unchecked_map
 from slam_backend.models.measurements import Measurements
+from slam_backend.pose_graph import PoseGraph
 from slam_backend.reference.filter import ReferenceFastSlam
 from slam_backend.resampling import RESAMPLING
+from slam_backend.smoother.graph_export import smoothed_graph, starts_graph
 from slam_backend.smoother.rejuvenation import Particles
 from slam_backend.state import (
     FLOAT64,
@@ -718,6 +720,27 @@ class FastSlam:
         slots = maps.used_slots()
         slots = slots[maps.of_particle(best, slots)[1] > 0]
         return maps.ids[slots], 1.0 / (1.0 + np.exp(-maps.odds_of_particle(best, slots)))
+
+    def graph(self, covariances: bool = True) -> PoseGraph:
+        """Return the smoothed poses of all robots, the landmarks and what links them, in the map frame.
+
+        All steps of the logs are smoothed, with the data association of the most probable particle; the filter does not
+        change. Poses are the starts, all steps with matched or new measurements, and the last ones; `times` are steps.
+        Optimising the graph elsewhere leaves it as it is: `slam_backend.smoother.graph_export` describes the edges.
+        `write_graph` writes it for other programs, and `PoseGraph.trajectory` returns the path of a robot.
+
+        Args:
+            covariances: Whether marginal covariances are computed; they take most of the time.
+
+        Raises:
+            ValueError: If there is no step yet, poses were given as exact, odometry has no noise, or the run cannot be
+                smoothed.
+        """
+        present = None if self.rejuvenation is None else self.rejuvenation.graph
+        options, starts = self.options, self.starts[:, :, : self.num_particles]
+        begun = starts_graph(starts, self._held_starts, options.motion, present)
+        logs = [log.arrays() for log in self.logs]
+        return smoothed_graph(begun, logs, options.motion, self.packed_camera, options.smoothing, covariances)
 
     def _check_robot(self, robot: int) -> int:
         """Return the index of a robot, or raise if it is out of range."""

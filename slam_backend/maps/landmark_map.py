@@ -1,6 +1,6 @@
 """Landmark maps: positions with covariances, descriptors, counts and ids in one frame."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -15,6 +15,7 @@ from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_int
 from slam_backend.geometry import rotate_covariances, transform_points
+from slam_backend.maps.map_files import to_csv, to_ply
 from slam_backend.state import (
     FLOAT32,
     FLOAT64,
@@ -30,6 +31,7 @@ from slam_backend.state import (
 FORMAT = "vslam landmark map"
 FORMAT_VERSION = 1
 FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
+OTHER_FORMATS: dict[str, Callable[["LandmarkMap"], str | bytes]] = {".csv": to_csv, ".ply": to_ply}
 
 
 @short_repr
@@ -232,11 +234,19 @@ class LandmarkMap:
         return unchecked_map(*(getattr(self, name)[rows] for name in FIELDS))
 
     def save(self, path: str | Path) -> None:
-        """Write the map to `path`, with no suffix added, as a numpy archive that `load` reads back bit for bit.
+        """Write the map to `path`, with no suffix added, in the format that its suffix names.
+
+        - `.npz` or none: a numpy archive that `load` reads back bit for bit.
+        - `.csv`: a table of ids, counts, positions and covariances, see `map_files.to_csv`.
+        - `.ply`: a cloud of points for MeshLab, CloudCompare or Open3D, see `map_files.to_ply`.
 
         Raises:
-            ValueError: If the file cannot be written; an existing file is then unchanged.
+            ValueError: If the suffix is another one, or the file cannot be written; an existing file is then unchanged.
         """
+        suffix = check_suffix(path)
+        if suffix in OTHER_FORMATS:
+            write_file(path, OTHER_FORMATS[suffix](self))
+            return
         arrays: dict[str, Any] = {name: getattr(self, name) for name in FIELDS}
         packed = BytesIO()
         np.savez(packed, format=np.array(FORMAT), version=np.array(FORMAT_VERSION), **arrays)
@@ -262,6 +272,23 @@ class LandmarkMap:
         if kind != FORMAT or version != FORMAT_VERSION:
             raise argument_error("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", hint)
         return cls(**arrays)  # type: ignore[arg-type]
+
+
+def check_suffix(path: str | Path, name: str = "path") -> str:
+    """Return the suffix of a file of a map, in lower case.
+
+    Args:
+        path: Path of the file.
+        name: Name of the argument in the error.
+
+    Raises:
+        ValueError: If `LandmarkMap.save` writes no such files.
+    """
+    suffix = checked_path(path, name).suffix.lower()
+    if suffix not in ("", ".npz", *OTHER_FORMATS):
+        hint = "Only .npz is read back; .csv and .ply are for other programs."
+        raise argument_error(name, "a name that ends in .npz, .csv or .ply", path, hint)
+    return suffix
 
 
 def _checked_covariances(value: Any, n: int) -> FloatArray:

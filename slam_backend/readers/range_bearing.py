@@ -168,17 +168,50 @@ def frames_at(
     Returns:
         T frames; None for a step without sightings.
     """
-    step = np.rint((sightings[:, 0] - times[0]) / (times[1] - times[0])).astype(np.int64) if len(times) > 1 else 0
-    step = np.clip(np.broadcast_to(step, len(sightings)), 0, len(times) - 1)
-    _, first = np.unique(step * (identities.max(initial=0) + 1) + identities, return_index=True)  # by step, identity
+    step = nearest_steps(times, sightings[:, 0])
+    first = first_of_each(step, identities)
     chosen, step = sightings[first], step[first]
     # Pose of the robot at the time of the sighting, relative to its pose at the step.
     offset = between(pose_at(times)[step], pose_at(chosen[:, 0]))
     points, covariances = points_from_polar(chosen[:, 1], chosen[:, 2], variances[first], offset)
-    described = descriptors[first]
-    bounds = np.searchsorted(step, np.arange(len(times) + 1))
+    return by_step(len(times), step, points, descriptors[first], covariances)
+
+
+def nearest_steps(times: FloatArray, stamps: FloatArray) -> IntArray:
+    """Return the nearest of evenly spaced steps (T,) [s] for each time (m,) [s].
+
+    >>> nearest_steps(np.array([0.0, 0.5, 1.0]), np.array([0.2, 0.3, 7.0])).tolist()
+    [0, 1, 2]
+    """
+    step = np.rint((stamps - times[0]) / (times[1] - times[0])).astype(np.int64) if len(times) > 1 else 0
+    return np.asarray(np.clip(np.broadcast_to(step, len(stamps)), 0, len(times) - 1))
+
+
+def first_of_each(step: IntArray, identities: IntArray) -> IntArray:
+    """Return the rows of the first sighting of each identity in each step, by step, then identity.
+
+    Args:
+        step: (m,) int64. Step of each sighting.
+        identities: (m,) int64 >= 0.
+    """
+    return np.asarray(np.unique(step * (identities.max(initial=0) + 1) + identities, return_index=True)[1])
+
+
+def by_step(
+    count: int, step: IntArray, points: FloatArray, descriptors: NDArray[np.float32], covariances: FloatArray
+) -> tuple[Measurements | None, ...]:
+    """Return the measurements of each of `count` steps; None for a step without any.
+
+    Args:
+        count: Number of steps T.
+        step: (m,) int64. Step of each point, ascending.
+        points: (m, 3) float64 [m], camera frame.
+        descriptors: (m, d) float32.
+        covariances: (m, 3, 3) float64 [m^2], camera frame.
+    """
+    bounds = np.searchsorted(step, np.arange(count + 1))
     return tuple(
-        Measurements(points[a:b], described[a:b], covariances[a:b]) if b > a else None for a, b in pairwise(bounds)
+        Measurements(points[a:b], descriptors[a:b], covariances[a:b]) if b > a else None for a, b in pairwise(bounds)
     )
 
 

@@ -41,7 +41,7 @@ def write_state(path: Any, magic: bytes, kind: type, tree: Any) -> None:
         path: The file.
         magic: Bytes by which such files are known.
         kind: Class of the object.
-        tree: Its state.
+        tree: State of the object, as parts.
 
     Raises:
         ValueError: If the tree contains objects of other kinds, or the file cannot be written.

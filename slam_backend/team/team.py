@@ -28,6 +28,7 @@ from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.pose_graph import PoseGraph
 from slam_backend.state import Child, Each, Int, Sizes, Snapshot, State, accepted, restore, restored, take
 from slam_backend.team.branches import Branch, process_step
 from slam_backend.team.communication import TrafficCounter, check_contacts, contact_components
@@ -401,6 +402,10 @@ class TeamSlam:
     def map(self, robot: int, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
         """Return the robot's map in its map frame; see `FastSlam.map`."""
         return self._find(robot)[0].filter.map(estimate, min_count)
+
+    def graph(self, robot: int, covariances: bool = True) -> PoseGraph:
+        """Return the smoothed graph of the robots of `known_robots(robot)`, in this order; see `FastSlam.graph`."""
+        return self._find(robot)[0].filter.graph(covariances)
 
     def merged_maps(self, merge: MergeEvent) -> tuple[LandmarkMap, LandmarkMap]:
         """Return the two maps joined by a merge as they were just before it, smoothed if the attempt smoothed them.

@@ -7,6 +7,7 @@ from scipy.io import savemat
 
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
+from slam_backend.pose_graph import Factors, PoseGraph
 from slam_backend.readers.conversions import integrate_commands
 from slam_backend.readers.kitti import ABSENT
 from slam_backend.readers.victoria import SENSOR, axle_velocities
@@ -100,3 +101,35 @@ def write_drive(folder: Path, bias: float = 0.0, bus: bool = False) -> None:
         c, s = np.cos(theta), np.sin(theta)
         rows.append(f"{c} 0 {-s} {-y} 0 1 0 0 {s} 0 {c} {x}\n")
     (folder / "poses" / "00.txt").write_text("".join(rows))
+
+
+def small_graph(robots: int = 1, noise: float = 1.0, steps: int = 40, seed: int = 4) -> tuple[PoseGraph, PoseGraph]:
+    """Return a graph of robots that drive circles in a ring of landmarks, estimates at zero, and the true graph."""
+    rng = np.random.default_rng(seed)
+    poses, of_robots, motions, sightings = [], [], [], []
+    for robot in range(robots):
+        pose = np.array([0.4 * robot, -0.3 * robot, 0.9 * robot])
+        for step in range(steps):
+            if step:
+                move = np.array([0.3, 0.0, 0.2 - 0.35 * robot]) + noise * rng.normal(0.0, [0.02, 0.01, 0.01])
+                motions.append((len(poses) - 1, len(poses), move))
+                pose = compose(pose, [0.3, 0.0, 0.2 - 0.35 * robot])
+            for row, point in enumerate(transform_points(inverse(pose), LANDMARKS)):
+                if np.abs(np.arctan2(point[1], point[0])) < 1.0:
+                    sightings.append((len(poses), row, point + noise * rng.normal(0.0, 0.05, 2)))
+            poses.append(pose)
+            of_robots.append(robot)
+    parts = {
+        "robots": np.array(of_robots), "pose_ids": np.tile(np.arange(steps), robots),
+        "landmark_ids": 3 + np.arange(len(LANDMARKS)),
+        "motions": _factors(motions, np.diag([0.0004, 0.0001, 0.0001])),
+        "sightings": _factors(sightings, 0.0025 * np.eye(2)),
+    }  # fmt: skip
+    unknown = PoseGraph(poses=np.zeros((len(poses), 3)), landmarks=np.zeros((len(LANDMARKS), 2)), **parts)
+    return unknown, PoseGraph(poses=np.array(poses), landmarks=LANDMARKS, **parts)
+
+
+def _factors(rows: list[tuple[int, int, np.ndarray]], covariance: np.ndarray) -> Factors:
+    """Return measurements with the same covariance."""
+    values = np.array([value for _, _, value in rows])
+    return Factors(np.array([(a, b) for a, b, _ in rows]), values, np.tile(covariance, (len(rows), 1, 1)))

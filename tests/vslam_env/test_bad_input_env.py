@@ -41,6 +41,7 @@ from vslam_env.world import (
     load_floorplan,
     load_walls_json,
     make_world,
+    save_ros_map,
     save_walls_json,
 )
 
@@ -239,7 +240,11 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     ],
     "world: expected the path of a file, got": [partial(load_floorplan, None), partial(load_walls_json, 3)],
     "metres_per_pixel: expected a finite number > 0": [partial(load_floorplan, "plan.png", metres_per_pixel=-1)],
-    "path: expected": [partial(save_walls_json, CLOSET, to) for to in (None, Path("nowhere") / "copy.json")],
+    "path: expected": [
+        *(partial(save_walls_json, CLOSET, to) for to in (None, Path("nowhere") / "copy.json")),
+        *(partial(save_ros_map, OccupancyGrid(), to) for to in (None, "map.png")),
+    ],
+    "grid: expected": [partial(save_ros_map, OccupancyGrid(), "map.yaml")],
     "world: expected walls that enclose free space for a disc": [begin(world=BOX), begin(world=NARROW)],
     "num_robots: expected at most as many as fit 5 m apart": [begin(world=CLOSET, num_robots=8)],
     "world: expected landmarks that robots can see": [

@@ -19,7 +19,9 @@ REFUSED = 3  # exit status where maps are not merged
 def merge(
     one: Annotated[Path, typer.Argument(help="Map, .npz of this project.")],
     other: Annotated[Path, typer.Argument(help="Map that is moved into the frame of the first.")],
-    out: Annotated[Path, typer.Option(help="File of the merged map; a picture goes beside it.")] = Path("merged.npz"),
+    out: Annotated[
+        Path, typer.Option(help="File of the merged map, .npz, .csv or .ply; a picture goes beside it.")
+    ] = Path("merged.npz"),
     min_inliers: Annotated[int, typer.Option(help="Fewest common landmarks.", min=3)] = 8,
     appearance: Annotated[bool, typer.Option(help="Whether descriptors decide which landmarks may be equal.")] = True,
     json: Json = None,
@@ -30,15 +32,13 @@ def merge(
     prints the reason, writes no map, and exits with status 3.
     """
     from slam_backend.core.files import check_writable
-    from slam_backend.core.validation import argument_error
     from slam_backend.maps.alignment import AlignmentOptions, align_maps
     from slam_backend.maps.fusion import fuse_maps
-    from slam_backend.maps.landmark_map import LandmarkMap
+    from slam_backend.maps.landmark_map import LandmarkMap, check_suffix
     from training.experiments.map_figure import draw_maps
     from training.experiments.run_folder import plain, to_json
 
-    if out.suffix != ".npz":
-        raise argument_error("out", "a name that ends in .npz", out, "Maps are written as numpy archives.")
+    check_suffix(out, "out")
     check_writable(out, "out")
     map_a, map_b = LandmarkMap.load(one), LandmarkMap.load(other)
     found = align_maps(map_a, map_b, options=AlignmentOptions(min_inliers=min_inliers, appearance=appearance))

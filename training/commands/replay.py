@@ -20,6 +20,8 @@ from training.replay.config import (
     MRCLAM,
     PAIRS,
     VICTORIA,
+    BagConfig,
+    GraphConfig,
     ImagesConfig,
     KittiConfig,
     LogConfig,
@@ -115,6 +117,47 @@ def replay_stereo(call: Call[ImagesConfig]) -> None:
             hint = "Omit it: two pairs are aligned in space."
             raise argument_error(name, "a drive of three pairs or more", "a folder with two pairs", hint)
     _align_pairs(call, ImagesConfig.from_mapping({"max_range": PAIR_RANGE} | values | names))
+
+
+@replay.command("bag")
+@options(BagConfig, "replay bag")
+def replay_bag(call: Call[BagConfig]) -> None:
+    """Replay a bag of ROS 1 or ROS 2 (extra ros): odometry, and landmarks with identities or descriptors.
+
+    Without --odometry or --landmarks its topics are listed. Several comma-separated topics are several robots, a team
+    with unknown starts.
+    """
+    from slam_backend.core.validation import argument_error
+    from training.replay.readers import read_bag
+
+    config = call.config
+    for name in ("odometry", "landmarks"):
+        if getattr(config, name) is None:
+            _list_topics(call.console, config.path)
+            hint = f"Choose a topic above that can be {name}."
+            raise argument_error(name, f"the topic of the {name}", f"no --{name}", hint)
+    _replay(call, config, read_bag)
+
+
+def _list_topics(console: Console, path: str) -> None:
+    """Print the topics of a bag."""
+    from rich.table import Table
+
+    from slam_backend.readers.bags import bag_topics
+
+    table = Table("topic", "type", "messages", "can be")
+    for topic, kind, count, use in bag_topics(path):
+        table.add_row(topic, kind or "several", str(count), use or "-")
+    console.print(table)
+
+
+@replay.command("graph")
+@options(GraphConfig, "replay graph")
+def replay_graph(call: Call[GraphConfig]) -> None:
+    """Replay a pose graph of g2o or PyFactorGraph with landmarks: its odometry and sightings, identities given."""
+    from training.replay.graphs import read_graph_log
+
+    _replay(call, call.config, read_graph_log)
 
 
 @replay.command(OWN)

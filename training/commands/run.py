@@ -38,6 +38,13 @@ def run(
         Path | None,
         typer.Option(help="Also write the episode to this .rrd file for rerun (extra rerun).", show_default=False),
     ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write the episode to this .mcap file of ROS 2, for Foxglove or rerun (extra ros).",
+            show_default=False,
+        ),
+    ] = None,
     show: Annotated[
         bool, typer.Option("--open", help="Open the browser: with --live at once, else at the end.")
     ] = False,
@@ -53,12 +60,15 @@ def run(
     from training.experiments.run_folder import plain
     from training.report.content import live_content
     from training.report.live import LiveView
+    from training.report.mcap_file import check_mcap, write_mcap
     from training.report.page import REPORT_FILE
     from training.report.recording import EpisodeRecorder
     from training.report.rerun_file import check_rerun, write_rerun
 
     if rerun is not None:
         check_rerun(rerun)
+    if mcap is not None:
+        check_mcap(mcap)
     chosen = call.config
     env = chosen.make_env()
     policies = chosen.make_policies(env)
@@ -91,13 +101,17 @@ def run(
             ("estimate", record.estimated), ("dead_reckoning", record.reckoned), ("truth", record.true_poses)
         ):  # fmt: skip
             folder.write_trajectory(f"robot{robot}_{kind}", Trajectory(record.times, paths[robot]))
+    agents = env.possible_agents
     maps = {"-".join(map(str, group)): record.maps[group[0]] for group in record.groups}
-    console.print(write_maps(folder, maps), soft_wrap=True)
+    grids = {"-".join(map(str, group)): env.belief(agents[group[0]]).grid for group in record.groups}
+    console.print(write_maps(folder, maps, grids), soft_wrap=True)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
     recording.save(folder.path)
     if rerun is not None:
         console.print(f"For rerun: {write_rerun(recording, rerun)}", soft_wrap=True)
+    if mcap is not None:
+        console.print(f"For ROS 2: {write_mcap(recording, mcap)}", soft_wrap=True)
     call.finish()
     if show and not live:
         webbrowser.open((folder.path / REPORT_FILE).resolve().as_uri())

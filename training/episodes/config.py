@@ -160,13 +160,17 @@ class RunConfig(ExperimentConfig):
         )  # fmt: skip
 
     def make_env(self) -> "ExplorationEnv":
-        """Build the environment, which observes what the policy reads."""
-        from agents.policy import keys_for
-        from agents.registry import make_policy
+        """Build the environment, which observes `observation_keys`."""
         from vslam_env import vslam_v1
 
-        keys = keys_for(make_policy(self.policy, self.action_type), self.action_type)
-        return vslam_v1.parallel_env(config=self.environment(), observation_keys=keys)
+        return vslam_v1.parallel_env(config=self.environment(), observation_keys=self.observation_keys())
+
+    def observation_keys(self) -> str | tuple[str, ...]:
+        """Return the keys of observations that the policy reads."""
+        from agents.policy import keys_for
+        from agents.registry import make_policy
+
+        return keys_for(make_policy(self.policy, self.action_type), self.action_type)
 
     def make_policies(self, env: "ExplorationEnv") -> "GuardedTeam":
         """Build one policy for each agent."""

@@ -88,7 +88,12 @@ class Progress:
     time: float  # Time since the reset [s]
     infos: Mapping[str, Mapping[str, Any]]  # Infos of all agents, as the environment returned them
     new_merges: tuple[MergeRecord, ...]  # Merges of this step
-    rewards: Mapping[str, float] = field(default_factory=dict)  # Rewards of all agents; none after the reset
+    observations: Mapping[str, Any] = field(default_factory=dict)  # Observations of all agents
+    # Of all agents, none after the reset:
+    actions: Mapping[str, Any] = field(default_factory=dict)
+    rewards: Mapping[str, float] = field(default_factory=dict)
+    terminations: Mapping[str, bool] = field(default_factory=dict)
+    truncations: Mapping[str, bool] = field(default_factory=dict)
 
 
 def run_episode(
@@ -132,12 +137,18 @@ def run_episode(
         observations, infos = env.reset(seed=seed, options=options)
         team.reset()
         log = _Log(env, infos)
-        on_step(Progress(0, 0.0, infos, ()))
+        on_step(Progress(0, 0.0, infos, (), observations))
         while env.agents and not should_stop():
             actions = team.act_all(observations, {agent: env.belief(agent) for agent in env.agents}, rngs, team_rng)
             log.before_step()
-            observations, rewards, _, _, infos = env.step(actions)
-            on_step(replace(log.after_step(infos, len(odometry) - 1), rewards=rewards))
+            observations, rewards, terminations, truncations, infos = env.step(actions)
+            progress = log.after_step(infos, len(odometry) - 1)
+            on_step(
+                replace(
+                    progress, observations=observations, actions=actions, rewards=rewards, terminations=terminations,
+                    truncations=truncations,
+                )
+            )  # fmt: skip
         return log.finish(np.array(odometry))
     finally:
         env.recorder = other

@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # numerical modules are imported when the command runs, so th
     from slam_backend.maps.landmark_map import LandmarkMap
     from slam_backend.team.reports import PairAttempts
     from training.experiments.run_folder import RunFolder
+    from vslam_env.navigation import OccupancyGrid
 
 # Metrics in the columns of the tables, with their digits
 MAPS = {"map_error": 3, "map_rmse_m": 3, "map_recall": 1, "map_precision": 1}
@@ -28,8 +29,7 @@ MISSED = {
     "one match": "Removing one match would have changed the result by more than the bound.",
     "paths": "The uncertainty of the paths left the transform between the starts uncertain beyond the bound.",
 }
-UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")
-MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair in UPPER))
+MAP_FILES = (".npz", ".csv", ".ply")
 
 
 def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
@@ -183,26 +183,25 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
         console.print(f"Warning, robot {', '.join(robots)}: {text}")
 
 
-def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
-    """Write each map as `map_<group>.npz` and `map_<group>.csv`, and return a line that lists them.
+def write_maps(
+    folder: "RunFolder", maps: "Mapping[str, LandmarkMap]", grids: "Mapping[str, OccupancyGrid] | None" = None
+) -> str:
+    """Write each map as `map_<group>` .npz, .csv and .ply, each grid as `grid_<group>.yaml` and .pgm.
 
     Args:
         maps: Maps by the name of the group, each in the start frame of the group's first robot.
+        grids: Occupancy grids of the first robots, by the same names.
+
+    Returns:
+        A line for the console that lists them.
     """
+    from vslam_env.world import save_ros_map
+
     for name, landmarks in maps.items():
-        landmarks.save(folder.path / f"map_{name}.npz")
-        folder.write_text(f"map_{name}.csv", to_csv(landmarks))
+        for suffix in MAP_FILES:
+            landmarks.save(folder.path / f"map_{name}{suffix}")
+    for name, grid in (grids or {}).items():
+        save_ros_map(grid, folder.path / f"grid_{name}.yaml")
     names = ", ".join(f"map_{name}" for name in maps)
-    return f"Maps as data: {names} (.npz for LandmarkMap.load, .csv)."
-
-
-def to_csv(landmarks: "LandmarkMap") -> str:
-    """Return a map as CSV, without descriptors; numbers have the shortest form that is exact."""
-    import numpy as np
-
-    upper = landmarks.covariances[:, *np.triu_indices(3)]
-    rows = zip(landmarks.ids, landmarks.counts, landmarks.means, upper, strict=True)
-    lines = [
-        ",".join(map(repr, [int(name), int(count), *mean.tolist(), *own.tolist()])) for name, count, mean, own in rows
-    ]
-    return "\n".join([",".join(MAP_COLUMNS), *lines]) + "\n"
+    line = f"Maps as data: {names} (.npz for LandmarkMap.load, .csv, .ply)"
+    return line + ("; grid_* (.yaml and .pgm for Nav2)." if grids else ".")

@@ -43,6 +43,8 @@ VICTORIA_MOTION = {
     "sigma_along": 0.03, "sigma_across": 0.03, "sigma_heading": 0.01, "sigma_turn": 0.1, "floor_position": 0.005,
     "floor_heading": 0.001,
 }  # fmt: skip
+# Assumed for tags of 10 to 20 cm up to 6 m away; messages with a covariance have their own.
+BAG_SENSOR = {"range_floor": 0.03, "range_share": 0.03, "bearing": 0.02, "height": 0.05}
 
 
 def log_path(below: Path, help: str = "Folder of the log.") -> Any:
@@ -146,6 +148,42 @@ class ImagesConfig(ReplayConfig):
 
         given = {name: getattr(self, name) for name in ("left", "right", "calibration", "times", "truth")}
         return StereoFiles(**{name: value for name, value in given.items() if value is not None})
+
+
+class BagConfig(ReplayConfig):
+    """Replay of a bag of ROS 1 or ROS 2; several topics of odometry are a team with unknown starts."""
+
+    path: str = option(
+        ..., "Bag: .bag of ROS 1; .mcap, .db3 or folder of ROS 2.", shown="none", hint="Give --path.", is_path=True
+    )
+    odometry: tuple[str, ...] | None = option(
+        None, "Topic of the odometry, comma-separated for several robots; without it topics are listed.", shown="none"
+    )
+    landmarks: tuple[str, ...] | None = option(
+        None, "Topic of the landmarks, one for each robot; without it topics are listed.", shown="none"
+    )
+    truth: tuple[str, ...] | None = option(None, "Topic of the true poses, one for each robot.", shown="none")
+    camera: str | None = option(None, "Topic of the CameraInfo of all robots, for their field of view.", shown="none")
+    base: tuple[str, ...] | None = option(
+        None, "Frame of the robot, or one for each.", shown="child_frame_id of the odometry"
+    )
+    tag_frames: str = option("tag*", "Pattern of the frames that are landmarks, where their topic is /tf.")
+    alone: bool = option(
+        False, "Run each robot separately, or as a team that merges maps.", name="--alone/--team", shown="team"
+    )
+    particles: int | None = option(
+        None, "Number of particles per filter.", shown="100 per robot of a team", ge=1, hint=ONE_PARTICLE
+    )
+    dt: float = option(0.25, "Time between steps [s].", gt=0.0, hint="Give seconds, near those between two frames.")
+    motion: OdometryModel = setting({}, "Assumed odometry noise.")
+    sensor: SightingNoise = setting(BAG_SENSOR, "Assumed noise of landmarks without covariance.")
+
+
+class GraphConfig(ReplayConfig):
+    """Replay of a pose graph with landmarks; the odometry noise is fitted to its edges."""
+
+    path: str = option(..., "Pose graph: .g2o, .pyfg or .fg.", hint="Give --path.", is_path=True)
+    truth: str | None = option(None, "Pose graph whose vertices are true.", shown="none", is_path=True)
 
 
 class LogConfig(ReplayConfig):

@@ -1,9 +1,9 @@
-"""Readers of public logs: MR.CLAM, Victoria Park and tracked features of KITTI, each as a `Log`.
+"""Readers of public logs: MR.CLAM, Victoria Park and tracked features of KITTI, and of bags of ROS, each as a `Log`.
 
 Each returns the log at a path; further arguments have the names of the options of its command.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,9 +15,9 @@ from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.readers import kitti, mrclam, victoria
+from slam_backend.readers import bags, kitti, mrclam, victoria
 from slam_backend.team.merge_scheduler import AttemptOptions
-from training.replay.config import MRCLAM_DRIVE, MRCLAM_MOTION, VICTORIA_MOTION
+from training.replay.config import BAG_SENSOR, MRCLAM_DRIVE, MRCLAM_MOTION, VICTORIA_MOTION
 from training.replay.core import Replay
 from training.replay.log import Log, RobotLog, Source
 from training.replay.metrics import PathScore, most_seen, travelled
@@ -35,6 +35,8 @@ GATES: dict[str, dict[str, Any]] = {
     "given": {"position_gate": 1e4, "new_landmark_gate": 1e6},
     "hidden": {"position_gate": PLANAR_GATE, "new_landmark_gate": 40.0, "recovery_position": 0.0},
 }
+# Bags. Descriptors have the usual gates.
+KNOWN_BY: dict[str, dict[str, Any]] = {"identities": GATES["given"], "positions": GATES["hidden"], "descriptors": {}}
 MOTION = OdometryModel(**MRCLAM_MOTION)
 # Early maps of these robots are deformed by tenths of a metre: inliers need not fit closely, but almost all landmarks
 # must be inliers. On two logs and four seeds, merges with 12 of the 15 landmarks had errors up to 24 degrees, with 14
@@ -208,6 +210,31 @@ class _Drive(Source):
             f"The robot returned at {seconds[1]:.0f} s to its place of {seconds[0]:.0f} s; relative error: "
             f"{error:.2f} m. Ended tracks are not matched again, so there is no loop closure."
         ]
+
+
+def read_bag(
+    path: str | Path, *, odometry: Sequence[str], landmarks: Sequence[str], truth: Sequence[str] | None = None,
+    camera: str | None = None, base: Sequence[str] | None = None, tag_frames: str = "tag*", alone: bool = False,
+    dt: float = 0.25, motion: OdometryModel | None = None, sensor: mrclam.SightingNoise | None = None,
+) -> Log:  # fmt: skip
+    """Return a bag of ROS 1 or ROS 2: a robot for each topic of odometry, several as a team with unknown starts."""
+    sensor = mrclam.SightingNoise(**BAG_SENSOR) if sensor is None else sensor
+    steps = bags.load_bag(path, odometry, landmarks, truth, camera, base, tag_frames, dt, sensor)
+    given = steps.kind == "identities"
+    robots = [
+        RobotLog(
+            odometry=own.odometry, measurements=own.measurements,
+            identities=list(map(_barcodes, own.measurements)) if given else None, truth=own.truth, number=number,
+        )
+        for number, own in enumerate(steps.robots, start=1)
+    ]  # fmt: skip
+    options: dict[str, Any] = {"motion": OdometryModel() if motion is None else motion, **KNOWN_BY[steps.kind]}
+    if steps.camera is not None:
+        options["camera"] = steps.camera
+    return Log(
+        times=steps.times, robots=robots, options=options, alone=alone, identified=given, title="Bag",
+        notes=steps.notes,
+    )  # fmt: skip
 
 
 def find_loop(truth: FloatArray) -> tuple[int, int] | None:

@@ -172,6 +172,22 @@ def _end_of(arrays: Sequence[NDArray[Any]], shape: tuple[int, int]) -> IntArray:
     return np.cumsum([len(array) for array in arrays]).reshape(shape)
 
 
+def part_of(ends: Array, row: int, robot: int) -> slice:
+    """Return the part of concatenated rows that belongs to a step and a robot.
+
+    Args:
+        ends: (J, K) or (F, K) ends of all parts.
+        row: Index of the step.
+        robot: Index of the robot.
+
+    >>> part_of(np.array([[2, 5], [5, 6]]), 1, 1)
+    slice(5, 6, None)
+    """
+    index = row * ends.shape[1] + robot
+    flat = ends.ravel()
+    return slice(int(flat[index - 1]) if index else 0, int(flat[index]))
+
+
 def ellipses(landmarks: LandmarkMap) -> FloatArray:
     """Return x, y [m], and semi-axes [m] and angle [rad] of the 95 % ellipse of each landmark, (n, 5)."""
     return np.column_stack([landmarks.means[:, :2], axes_95(landmarks.covariances[:, [0, 0, 1], [0, 1, 1]])])

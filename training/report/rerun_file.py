@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.files import check_writable
 from slam_backend.core.validation import argument_error
-from training.report.recording import Recording
+from training.report.recording import Recording, part_of
 from vslam_env.rendering.palette import robot_colour
 
 TIMELINE = "episode"
@@ -45,7 +45,7 @@ def write_rerun(recording: Recording, file: Path) -> Path:
     import rerun
 
     stream = rerun.RecordingStream("vslam_env")
-    stream.save(file)
+    stream.save(file, default_blueprint=_layout())
     if len(recording.walls):
         walls = _picture(recording.walls.reshape(-1, 2, 2))
         stream.log("world/walls", rerun.LineStrips2D(walls, radii=LINE, colors=[GREY]), static=True)
@@ -73,6 +73,20 @@ def write_rerun(recording: Recording, file: Path) -> Path:
     return file
 
 
+def _layout() -> Any:
+    """Return the views with which the viewer opens: the world, beside it scores and events."""
+    from rerun import blueprint
+
+    charts = {"map error E [m]": "map_error", "position error [m]": "pose_error", "coverage": "coverage"}
+    beside = [
+        blueprint.TimeSeriesView(origin=f"scores/{metric}", name=title) for title, metric in charts.items()
+    ] + [blueprint.TextLogView(origin="events", name="merges")]  # fmt: skip
+    world = blueprint.Spatial2DView(contents=["world/**", "robots/**"], name="world")
+    return blueprint.Blueprint(
+        blueprint.Horizontal(world, blueprint.Vertical(*beside), column_shares=[3, 2]), collapse_panels=True
+    )
+
+
 def _picture(points: Array) -> Array:
     """Return points (..., 2) with y downwards."""
     return np.asarray(points, np.float64) * [1.0, -1.0]
@@ -98,7 +112,7 @@ def _log_robot(
     if len(path) > 1:
         stream.log(f"{root}/path", rerun.LineStrips2D([_picture(path)], radii=LINE, colors=[colour]))
     if recording.sight_ends.size:
-        seen = recording.sights[_part(recording.sight_ends, step, robot)]
+        seen = recording.sights[part_of(recording.sight_ends, step, robot)]
         x, y = (float(value) for value in recording.truth[step, robot, :2])
         lines = np.stack([np.broadcast_to([x, y], seen.shape), seen], axis=1)
         stream.log(f"{root}/sights", rerun.LineStrips2D(_picture(lines), radii=0.3 * LINE, colors=[colour]))
@@ -111,18 +125,11 @@ def _log_robot(
 
 def _log_map(rerun: Any, stream: Any, recording: Recording, key: int, robot: int, colour: tuple[int, int, int]) -> None:
     """Log map and candidates of a robot at a step that has them; a shared map is logged with its first robot."""
-    points = recording.map_points[_part(recording.map_ends, key, robot), :2]
+    points = recording.map_points[part_of(recording.map_ends, key, robot), :2]
     stream.log(f"robots/{robot}/map", rerun.Points2D(_picture(points), radii=SPOT, colors=[colour]))
     if recording.candidate_ends.size:
-        rows = recording.candidates[_part(recording.candidate_ends, key, robot)]
+        rows = recording.candidates[part_of(recording.candidate_ends, key, robot)]
         goals = rows[rows[:, 3] > 0]
         places = rerun.Points2D(_picture(rows[:, :2]), radii=SPOT, colors=[GREY])
         stream.log(f"robots/{robot}/candidates", places)
         stream.log(f"robots/{robot}/goal", rerun.Points2D(_picture(goals[:, :2]), radii=2 * SPOT, colors=[colour]))
-
-
-def _part(ends: Array, row: int, robot: int) -> slice:
-    """Return the part of concatenated rows that belongs to a step and a robot."""
-    index = row * ends.shape[1] + robot
-    flat = ends.ravel()
-    return slice(int(flat[index - 1]) if index else 0, int(flat[index]))

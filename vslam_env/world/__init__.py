@@ -7,7 +7,7 @@ Order of construction at a reset: `make_world` -> `FreeSpace` -> `place_landmark
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.landmarks import LandmarkConfig, place_landmarks
 from vslam_env.world.loaders.floorplan import load_floorplan, load_walls_json, save_walls_json
-from vslam_env.world.loaders.ros_map import load_ros_map
+from vslam_env.world.loaders.ros_map import load_ros_map, save_ros_map
 from vslam_env.world.loaders.splits import SPLITS, draw_world_seed
 from vslam_env.world.odometry import OdometryNoise, draw_bias, read_odometry
 from vslam_env.world.registry import (
@@ -42,5 +42,6 @@ __all__ = [
     "place_landmarks",
     "portable_source",
     "read_odometry",
+    "save_ros_map",
     "save_walls_json",
 ]

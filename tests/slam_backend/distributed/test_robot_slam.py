@@ -105,7 +105,7 @@ def test_all_robots_of_a_group_agree(met: Any) -> None:
 @settings(max_examples=15, deadline=None)
 @given(data=st.data())
 def test_lost_late_repeated_and_reordered_messages_do_no_harm(data: st.DataObject) -> None:
-    """Whatever becomes of messages on the way, none is refused, and once all is told the groups agree."""
+    """Whatever becomes of messages on the way, none is refused, and once all maps have arrived the groups agree."""
     simulation = SimulatedTeam(3, seed=data.draw(st.integers(0, 3)))
     robots = robots_of(simulation)
     on_the_way: list[tuple[int, bytes]] = []
@@ -125,7 +125,7 @@ def test_lost_late_repeated_and_reordered_messages_do_no_harm(data: st.DataObjec
         assert all(known[NAMES.index(name)] == group for name in group)
 
 
-def test_nobody_waits_for_a_silent_robot(met: Any) -> None:
+def test_a_silent_robot_stops_no_other(met: Any) -> None:
     """A robot that is killed only stops to be heard: the others keep its last map, and go on."""
     simulation = SimulatedTeam(3, seed=5)
     robots = robots_of(simulation)
@@ -180,7 +180,7 @@ def test_a_robot_with_an_empty_memory_replaces_its_former_self(met: Any) -> None
     assert robots[0]._inbox.maps["bo"].life == 1
 
 
-def test_two_robots_of_one_name_are_told(met: Any) -> None:
+def test_two_robots_of_one_name_are_noticed(met: Any) -> None:
     """A robot that hears its own name in a later life says so."""
     simulation = SimulatedTeam(1, seed=5)
     robot, other = robots_of(simulation)[0], robots_of(simulation, life=7)[0]

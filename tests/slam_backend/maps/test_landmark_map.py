@@ -106,6 +106,31 @@ def test_saved_maps_load_bit_for_bit(tmp_path: Path) -> None:
         assert_same(m, LandmarkMap.load(path))
 
 
+def test_clouds_and_tables_hold_what_other_programs_read(tmp_path: Path) -> None:
+    """A PLY has position, count and the root of the covariance's trace of each landmark; a CSV exact numbers."""
+    m = LandmarkMap(**fields())
+    m.save(tmp_path / "map.PLY")
+    header, _, body = (tmp_path / "map.PLY").read_bytes().partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", f"element vertex {len(m)}"]
+    assert lines[3:] == [f"property float {name}" for name in ("x", "y", "z", "count", "sigma")]
+    rows = np.frombuffer(body, "<f4").reshape(len(m), 5)
+    sigma = np.sqrt(np.trace(m.covariances, axis1=1, axis2=2))
+    np.testing.assert_allclose(rows, np.column_stack([m.means, m.counts, sigma]), rtol=1e-6)
+    m.save(tmp_path / "map.csv")
+    table = np.genfromtxt(tmp_path / "map.csv", delimiter=",", names=True)
+    assert np.array_equal(np.column_stack([table[f"{axis}_m"] for axis in "xyz"]), m.means)
+    LandmarkMap.empty(D).save(tmp_path / "none.ply")
+    assert b"element vertex 0\n" in (tmp_path / "none.ply").read_bytes()
+
+
+def test_other_suffixes_are_refused(tmp_path: Path) -> None:
+    """A suffix that names no format of maps is refused, and nothing is written."""
+    with pytest.raises(ValueError, match=r"path: expected a name that ends in \.npz, \.csv or \.ply, got .*map\.pcd"):
+        LandmarkMap(**fields()).save(tmp_path / "map.pcd")
+    assert not list(tmp_path.iterdir())
+
+
 def test_damaged_files_never_load_as_another_map(tmp_path: Path) -> None:
     """A file cut short or with a changed byte gives the clear error, or still the same map."""
     m = LandmarkMap(**fields())

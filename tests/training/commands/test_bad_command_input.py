@@ -22,8 +22,17 @@ BAD: dict[str, dict[str, str]] = {
         "--robots 9": f"{ROBOTS} 9. Use 1 to 8 robots.", "--robots 0 --json -": f"{ROBOTS} 0.",
         "--action-type fly": "action_type: expected one of 'continuous', 'discrete', 'goal', got 'fly'.",
         "--json full": "json: expected a file, got a folder. Name a file in 'full'.",
+        "--mcap run.bag": "mcap: expected a name that ends in .mcap, got 'run.bag'.",
         "--world fig5 --out full": "out: expected a new or empty folder",
         "--world fig5 --out /proc/version/run": "out: expected a folder that can be written",
+    },
+    "record": {
+        "--episodes 0": "episodes: expected an int >= 1, got 0. Record at least one episode.",
+        "--observations some": "observations: expected one of 'driver', 'goal', 'all', got 'some'.",
+        "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
+        "--world fig5 --out full": "out: expected a new or empty folder",
+        "--workers 0": "workers: expected an int >= 1, got 0.",
+        "--verify full": "verify: expected the config.toml of an earlier run, got no such file.",
     },
     "train": {
         "--robots 9": f"{ROBOTS} 9.",
@@ -77,6 +86,19 @@ BAD: dict[str, dict[str, str]] = {
         "": "path: expected an archive (.npz) of KITTI features, ",
     },
     "replay stereo": {"--path none": "path: expected a folder with two stereo pairs (left_img_0.png, "},
+    "replay bag": {
+        "": "path: expected a value, got 'none'. Give --path.",
+        "--path none.bag": "path: expected a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), got no such path",
+        "--path broken.json": "path: expected a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), got '",
+        "--path full --odometry /odom --landmarks /tags": "path: expected a bag (.bag, .mcap, .db3, or a folder with ",
+        "--path . --dt 0": "dt: expected a finite number > 0, got 0.0. Give seconds, near those between two frames.",
+        "--path . --odometry /odom,/odom": "odometry: expected at least one value, each once, got ",
+    },
+    "replay graph": {
+        "": "path: expected a value, got 'none'. Give --path.",
+        "--path none.txt": "path: expected a pose graph (.g2o, .pyfg, .fg), got ",
+        "--path none.g2o": "path: expected a pose graph (g2o), got ",
+    },
     "replay MODULE:FUNCTION": {
         "": "path: expected a value, got 'none'. Give --path.",
         "--path .": "reader: expected MODULE:NAME of a reader, got ",

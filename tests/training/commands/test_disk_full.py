@@ -41,7 +41,9 @@ def _files_up_to(size: int) -> Iterator[None]:
             ("--no-video",),
             10_000,
             "map.png",
-            {"config.toml", "environment.toml", "metrics.json", "map_0.csv", "map_0.npz"},
+            {"config.toml", "environment.toml", "metrics.json"}
+            | {f"map_0.{kind}" for kind in ("npz", "csv", "ply")}
+            | {"grid_0.yaml", "grid_0.pgm"},
         ),
         ((), 4_000, "video.mp4", {"config.toml", "environment.toml"}),
     ],

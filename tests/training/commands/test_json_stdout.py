@@ -10,20 +10,29 @@ from typing import Any
 
 import pytest
 import typer.main
-from small_logs import write_drive, write_log, write_park
+from builders.bags import write_circle
+from small_logs import small_graph, write_drive, write_log, write_park
 
+from slam_backend.readers.pose_graphs import write_graph
 from training import cli
 
 SEED = ("--first-seed", "100")
 # Minimal arguments of each command with --json, in a folder with logs and a model.
 LEAST = {
     "run": ("--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--no-video"),
+    "record": (
+        "--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--episodes", "2", *SEED,
+    ),
     "train": ("--preset", "smoke", "--robots", "1", "--workers", "0", "--steps", "24"),
     "evaluate": ("trained", "--seeds", "2", "--policies", "random_goals", *SEED),
     "replay mrclam": ("--path", "robots", "--duration", "5", "--particles", "3"),
     "replay victoria": ("--path", "park", "--duration", "6", "--particles", "3"),
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
+    "replay graph": ("--path", "graph.g2o", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
+    "replay bag": (
+        "--path", "circle.mcap", "--odometry", "/odom", "--landmarks", "/tags", "--duration", "3", "--particles", "3",
+    ),
     "bench speed filter": (
         "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
     ),
@@ -64,6 +73,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_log(made / "robots", noise=1.0)
     write_park(made / "park")
     write_drive(made / "drive")
+    write_circle(made / "circle.mcap", seconds=5.0)
+    write_graph(small_graph()[0], made / "graph.g2o")
     return made
 
 

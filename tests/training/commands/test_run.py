@@ -297,7 +297,9 @@ def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
     usual |= {"recording.npz", "report.html"}
     groups = json.loads((one / "metrics.json").read_text())["groups"]
     stems = {f"map_{'-'.join(map(str, group))}" for group in groups}
-    assert names == paths | usual | {f"{stem}.{kind}" for stem in stems for kind in ("npz", "csv")}
+    assert names == paths | usual | {f"{stem}.{kind}" for stem in stems for kind in ("npz", "csv", "ply")} | {
+        stem.replace("map_", "grid_") + suffix for stem in stems for suffix in (".yaml", ".pgm")
+    }
     assert all(len(LandmarkMap.load(one / f"{stem}.npz")) > 0 for stem in stems)
     assert {file.name for file in two.iterdir()} == names - {"video.mp4"}
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (one, two))

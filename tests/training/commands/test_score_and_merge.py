@@ -86,6 +86,8 @@ def test_maps_from_files_are_merged_or_refused_with_the_reason(vslam: Any, files
     assert len(LandmarkMap.load("both.npz")) == 30
     with Image.open("both.png") as picture:
         assert min(picture.size) > 300
+    assert vslam("merge", "a.npz", "b.npz", "--out", "both.ply").status == 0
+    assert Path("both.ply").read_bytes().startswith(b"ply\n")
     done = vslam("merge", "a.npz", "few.npz", "--out", "none.npz")
     assert done.status == 3
     assert "Reason: too few candidates" in done.out
@@ -94,7 +96,7 @@ def test_maps_from_files_are_merged_or_refused_with_the_reason(vslam: Any, files
     for arguments, says in (
         (("a.npz", "t0.txt"), "path: expected a file written by LandmarkMap.save"),
         (("a.npz", "gone.npz"), "got no such file"),
-        (("a.npz", "b.npz", "--out", "map.csv"), "out: expected a name that ends in .npz"),
+        (("a.npz", "b.npz", "--out", "map.txt"), "out: expected a name that ends in .npz, .csv or .ply, got 'map.txt'"),
     ):
         done = vslam("merge", *arguments)
         assert done.status == 2

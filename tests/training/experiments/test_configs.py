@@ -12,6 +12,7 @@ from slam_backend.readers.stereo_files import StereoFiles
 from studies import accuracy, alignment, losses, mrclam_pairs, stereo, training_speed
 from training.bench.exploration import config as exploration
 from training.bench.speed import config as speed
+from training.dataset.config import RecordConfig
 from training.episodes.config import RunConfig
 from training.experiments import config as experiments
 from training.experiments.config import ExperimentConfig
@@ -44,8 +45,10 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     paper.Fig6Config: {"regimes": ("good",)}, replay.ImagesConfig: {"path": "images", "descriptor": "orb"},
     replay.KittiConfig: {"path": "drive", "truth": "poses.txt"},
     replay.MrclamConfig: {"path": "log", "robots": (1, 4), "motion": {"sigma_along": 0.125}},
-    replay.LogConfig: {"path": "log", "particles": 7},
+    replay.LogConfig: {"path": "log", "particles": 7}, replay.GraphConfig: {"path": "a.g2o", "truth": "b.g2o"},
+    replay.BagConfig: {"path": "log.bag", "odometry": ("/odom",), "sensor": {"height": 0.125}},
     replay.VictoriaConfig: {"path": "log", "sensor": {"range": 0.25}}, RunConfig: {"world": "maze", "max_cycles": 12},
+    RecordConfig: {"world": "maze", "max_cycles": 12, "episodes": 7, "observations": "all"},
 }  # fmt: skip
 KINDS = [pytest.param(kind, id=kind.__name__) for kind in CASES]
 AT_LEAST_0 = "an int >= 0"
@@ -124,7 +127,15 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "drive": {3: "a table of delay, speed, turn"}, "duration": {float("nan"): ABOVE_0},
     },
     replay.LogConfig: {"particles": {0: AT_LEAST_1}},
+    replay.BagConfig: {
+        "dt": {0.0: ABOVE_0}, "odometry": {(): "at least one value, each once"}, "particles": {0: AT_LEAST_1},
+        "alone": {"yes": "a bool"},
+    },
+    replay.LogConfig: {"particles": {0: AT_LEAST_1}}, replay.GraphConfig: {"particles": {0: AT_LEAST_1}},
     replay.VictoriaConfig: {"particles": {True: AT_LEAST_1, 2.5: AT_LEAST_1}},
+    RecordConfig: {
+        "episodes": {0: AT_LEAST_1}, "robots": {9: ROBOTS}, "observations": {"none": "one of 'driver', 'goal', 'all'"},
+    },
     RunConfig: {
         "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
         "action_type": {"jump": "one of 'continuous', 'discrete', 'goal'"}, "max_cycles": {0: AT_LEAST_1},

@@ -55,7 +55,7 @@ def test_the_example_is_replayed_and_repeats_itself(
     assert row["map_recall"] == row["map_precision"] == 1.0
     assert {file.name for file in run.iterdir()} == {
         "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum", "truth.tum",
-        "map_1.npz", "map_1.csv", "recording.npz", "report.html",
+        "map_1.npz", "map_1.csv", "map_1.ply", "recording.npz", "report.html",
     }  # fmt: skip
 
 

@@ -86,7 +86,7 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
     assert {file.name for file in first.iterdir()} == {
         "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", "map_2-5.npz", "map_2-5.csv",
-        "recording.npz", "report.html", *names,
+        "map_2-5.ply", "recording.npz", "report.html", *names,
     }  # fmt: skip
     assert "Maps as data: map_2-5" in said.out
     for file in first.glob("*.png"):

@@ -191,7 +191,7 @@ def test_a_run_is_written_and_repeats_itself(
     truth = {"truth.tum"} if command == "kitti" else set()
     assert {file.name for file in first.iterdir()} == truth | {
         "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum",
-        "map_1.npz", "map_1.csv", "recording.npz", "report.html",
+        "map_1.npz", "map_1.csv", "map_1.ply", "recording.npz", "report.html",
     }  # fmt: skip
     assert (first / "replay.png").read_bytes()[:4] == b"\x89PNG"
     assert "Maps as data: map_1 (" in said.out

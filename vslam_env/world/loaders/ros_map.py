@@ -1,18 +1,23 @@
-"""Loader of ROS maps: a YAML file and an image."""
+"""ROS maps, a YAML file and an image: their loader, and the export of occupancy grids."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from slam_backend.core.files import checked_path, write_file
 from slam_backend.core.image_files import grey_levels, read_image
 from slam_backend.core.text_files import existing_file, read_yaml
 from slam_backend.core.validation import argument_error, check_array, check_choice, check_float
 from slam_backend.geometry import transform_points
+from vslam_env.navigation.occupancy_grid import CELL, FREE, OCCUPIED, OccupancyGrid, centre_of
 from vslam_env.world.loaders.floorplan import floor_part, trace
 from vslam_env.world.spec import World
 
 UNKNOWN = 205  # level of unknown cells in maps that map_saver writes, whatever `free_thresh` it adds
+LEVELS = {FREE: 254, OCCUPIED: 0}  # levels of other cells that map_saver writes
+SUFFIXES = (".yaml", ".yml")
 MODES = ("trinary", "scale", "raw")
 HINT = "Write image, resolution, origin, negate, occupied_thresh and free_thresh, like map_saver."
 
@@ -49,6 +54,40 @@ def load_ros_map(
     part = floor_part(free, resolution, str(path), outside)
     walls = trace(part, resolution, tolerance_px, robot_radius, str(path))
     return World(path.stem, transform_points(settings["origin"], walls.reshape(-1, 2)).reshape(-1, 4))
+
+
+def save_ros_map(grid: OccupancyGrid, path: str | Path) -> None:
+    """Write the known part of an occupancy grid as a map that map_server of ROS and Nav2 loads.
+
+    A pixel is a cell: 254 where it is free, 0 where it is occupied, 205 where it is unknown. The map frame is the start
+    frame of the grid's robot; `origin` is the lower left corner of the known part. `load_ros_map` traces its walls.
+
+    Args:
+        grid: Occupancy grid, for example `env.belief(agent).grid`.
+        path: Path of the YAML file; the image goes beside it, with the suffix .pgm. Existing files are overwritten.
+
+    Raises:
+        ValueError: If nothing is known, the name does not end in .yaml or .yml, or a file cannot be written.
+    """
+    path = checked_path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise argument_error("path", "a name that ends in .yaml or .yml", path, "The image goes beside it.")
+    top, left, bottom, right = grid.bounds.tolist()
+    if bottom <= top:
+        raise argument_error("grid", "a grid with known cells", "an empty grid", "Export it after the first scan.")
+    cells = grid.cells[top:bottom, left:right]
+    pixels = np.full(cells.shape, UNKNOWN, np.uint8)
+    for state, level in LEVELS.items():
+        pixels[cells == state] = level
+    height, width = bottom - top, right - left
+    x, y = map(float, (centre_of([top, left], len(grid.cells)) - 0.5 * CELL).round(9))
+    image = path.with_suffix(".pgm")
+    write_file(image, f"P5\n{width} {height}\n255\n".encode() + pixels[::-1].tobytes())  # rows from the top
+    write_file(
+        path,
+        f"image: {json.dumps(image.name)}\nmode: trinary\nresolution: {CELL:g}\norigin: [{x!r}, {y!r}, 0.0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+    )
 
 
 def image_of_ros_map(path: Path) -> Path:

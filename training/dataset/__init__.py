@@ -1,0 +1,1 @@
+"""Episodes as a data set: recorded by `vslam record`, read by plain numpy, this package or Minari."""
