@@ -347,7 +347,8 @@ def _known(
     matches, _ = candidates(one, other, options)
     inside = inlier_mask(match_table(one, other, matches), matches, motion, options.position_floor**2,
                          options.position_gate)  # fmt: skip
-    return Alignment(True, "", *motion, covariance, matches[inside], 0.0)
+    x, y, turn = motion
+    return Alignment(True, "", x, y, turn, covariance, matches[inside], 0.0)
 
 
 def _differ(one: FloatArray, other: FloatArray) -> bool:
