@@ -1,4 +1,4 @@
-"""Robots of a team in processes of their own, which tell each other their maps (`docs/explanation/distributed.md`)."""
+"""Robots of a team in processes of their own, which exchange maps and graphs; see docs/explanation/distributed.md."""
 
 from slam_backend.distributed.robot_slam import LinkEvent, RobotSlam
 

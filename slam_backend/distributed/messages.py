@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.validation import FloatArray, argument_error
+from slam_backend.core.validation import FloatArray, IntArray, argument_error
+from slam_backend.geometry import inverse
 from slam_backend.maps.landmark_map import FIELDS, LandmarkMap
+from slam_backend.smoother.graph import SlamGraph
 from slam_backend.state import (
     FLOAT32,
     FLOAT64,
@@ -38,36 +40,39 @@ MOST_BYTES = 16_384  # of the payload of a message; a message with its header fi
 MOST_PARTS = 256  # of a map
 MOST_NAME = 64  # bytes of a name
 MOST_PEERS = 32
+ONE_ROBOT = {"K": 1}  # sizes of the state of one robot
 
 
 @short_repr
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Link:
-    """Motion between the start frames of two robots, as one of them found it by their maps.
+    """Alignment of the maps of two robots, as one of them found it.
 
     Attributes:
         other: Name of the other robot.
         life: Life of the other robot whose map it was.
         motion: (3,) float64 [m, m, rad]. Start of the other robot in the frame of the one that found it.
-        covariance: (3, 3) float64 [m, m, rad].
-        inliers: Number of common landmarks.
+        pairs: (n, 2) int64 rows (own landmark, landmark of the other) of the common landmarks, by ids.
     """
 
     STATE: ClassVar = State(
         other=Text(), life=Int(), motion=Array(FLOAT64, "3", -MAX_DISTANCE, MAX_DISTANCE),
-        covariance=Array(FLOAT64, "3 3"), inliers=Int(1, MAX_LANDMARKS),
+        pairs=Array(INT64, "pairs 2", 0, MAX_LANDMARKS),
     )  # fmt: skip
     other: str
     life: int
     motion: FloatArray
-    covariance: FloatArray
-    inliers: int
+    pairs: IntArray
+
+    def inverted(self, by: str, life: int) -> "Link":
+        """Return the link as seen from the other robot, given who found it."""
+        return Link(other=by, life=life, motion=inverse(self.motion), pairs=self.pairs[:, ::-1])
 
 
 @short_repr
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SharedMap:
-    """What one robot tells the others: its pose, its map and its links.
+    """What one robot tells the others: its pose, its map, the graph of its smoother, and its links.
 
     Attributes:
         robot: Name of the robot.
@@ -78,7 +83,8 @@ class SharedMap:
         means, covariances: (n, 3) float32 [m], (n, 3, 3) float64 [m^2], own start frame.
         descriptors: (n, d) float32.
         counts, ids: (n,) int64.
-        links: Motions that it found between its frame and those of others.
+        graph: What the robot's measurements say of its path and landmarks, condensed; ids are those of the map.
+        links: Alignments that it found between its map and those of others.
     """
 
     STATE: ClassVar = State(
@@ -86,7 +92,7 @@ class SharedMap:
         pose=Array(FLOAT64, "3", -MAX_DISTANCE, MAX_DISTANCE), pose_covariance=Array(FLOAT64, "3 3"),
         means=Array(FLOAT32, "n 3", -MAX_DISTANCE, MAX_DISTANCE), covariances=Array(FLOAT64, "n 3 3"),
         descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR), counts=Array(INT64, "n", 1),
-        ids=Array(INT64, "n", 0, MAX_LANDMARKS), links=Each(Record(Link)),
+        ids=Array(INT64, "n", 0, MAX_LANDMARKS), graph=Record(SlamGraph), links=Each(Record(Link)),
     )  # fmt: skip
     robot: str
     life: int
@@ -99,6 +105,7 @@ class SharedMap:
     descriptors: NDArray[np.float32]
     counts: NDArray[np.int64]
     ids: NDArray[np.int64]
+    graph: SlamGraph
     links: Sequence[Link]
 
     @staticmethod
@@ -109,13 +116,14 @@ class SharedMap:
     @classmethod
     def of(
         cls, robot: str, life: int, number: int, step: int, pose: tuple[FloatArray, FloatArray], landmarks: LandmarkMap,
-        links: Sequence[Link],
+        graph: SlamGraph, links: Sequence[Link],
     ) -> "SharedMap":  # fmt: skip
         """Return what a robot tells about its map."""
         return cls(
             robot=robot, life=life, number=number, step=step, pose=pose[0], pose_covariance=pose[1],
             means=landmarks.means.astype(np.float32), covariances=landmarks.covariances,
-            descriptors=landmarks.descriptors, counts=landmarks.counts, ids=landmarks.ids, links=tuple(links),
+            descriptors=landmarks.descriptors, counts=landmarks.counts, ids=landmarks.ids, graph=graph,
+            links=tuple(links),
         )  # fmt: skip
 
     def landmarks(self) -> LandmarkMap:
@@ -234,9 +242,10 @@ class Inbox:
         """Read a map of which all parts are there."""
         first = parts[0]
         try:
-            shared: SharedMap = Record(SharedMap).check("message", decode(b"".join(part.payload for part in parts)), {})
-        except ValueError as error:
-            return str(error)
+            tree = decode(b"".join(part.payload for part in parts))
+            shared: SharedMap = Record(SharedMap).check("message", tree, dict(ONE_ROBOT))
+        except Exception as error:  # of any kind: the tree may hold anything
+            return " ".join(str(error).split()) or type(error).__name__
         if (shared.robot, shared.life, shared.number) != (first.robot, first.life, first.number):
             return f"expected a map of {first.robot!r}, got one of {shared.robot!r}"
         length = shared.descriptors.shape[1]

@@ -1,13 +1,12 @@
 """One robot's part of a team whose robots run in processes of their own.
 
-A robot runs a filter of its own and publishes its map at intervals. It aligns its map with those it has received
-(Sec. 3.1); a success is a *link*, the motion between two start frames, which it publishes, too. Robots that links
-connect form a group; each of them places and fuses the maps of its group by the same links. Nothing waits: a robot that
-falls silent leaves its last map, and a link that later maps contradict is undone.
+A robot runs a filter of its own and publishes its map and the graph of its smoother at intervals. It aligns its map
+with those it has received (Sec. 3.1); a success is a *link*, which it publishes, too. Robots that links connect form a
+group; each of them joins the graphs of its group at the common landmarks, and finds the same joint map. Nothing waits:
+a robot that falls silent leaves its last map, and a link that later maps contradict is undone.
 """
 
 import hashlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -15,16 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.validation import FloatArray, argument_error, check_int, check_kind
-from slam_backend.distributed.messages import MOST_NAME, Inbox, Link, SharedMap, messages_of, read_message
+from slam_backend.distributed.joint_map import JointMap, joint_map
+from slam_backend.distributed.messages import MOST_NAME, ONE_ROBOT, Inbox, Link, SharedMap, messages_of, read_message
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import PoseEstimate, StepReport
-from slam_backend.geometry import compose, inverse, rotation
+from slam_backend.geometry import compose, inverse, rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.correspondences import candidates
-from slam_backend.maps.fusion import fuse_maps
-from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.maps.match_table import match_table
-from slam_backend.maps.verification import inlier_mask
+from slam_backend.maps.landmark_map import FIELDS, LandmarkMap, unchecked_map
 from slam_backend.models.measurements import Measurements
 from slam_backend.state import (
     MAX_INT,
@@ -35,7 +31,6 @@ from slam_backend.state import (
     Options,
     Record,
     Row,
-    Sizes,
     State,
     Text,
     accepted,
@@ -74,7 +69,7 @@ class RobotSlam:
         team: Word that all robots of the team share: messages of others are refused.
         life: Number of this start; larger after each restart with an empty memory, such as `time.time_ns()`.
         seed: Seed of the filter, see `FastSlam`.
-        share_every: Steps between two publications of the map.
+        share_every: Steps between two publications of the map; it is published after the first rejuvenation.
         attempt_every: Steps between two attempts to align the map with one of those received.
         min_count: Least number of measurements of the landmarks that it publishes.
         alignment: Options of alignments.
@@ -114,10 +109,15 @@ class RobotSlam:
             AlignmentOptions() if alignment is None else check_kind("alignment", alignment, AlignmentOptions)
         )
         self.filter = FastSlam(1, seed=seed, **options)
+        if self.filter.options.rejuvenate_every is None:
+            hint = "Robots tell each other what their smoothers know: give a number of steps."
+            raise argument_error("rejuvenate_every", "a smoother", None, hint)
         self._inbox = Inbox()
         self._own: SharedMap | None = None
         self._number = 0
         self._links: dict[str, Link] = {}
+        self._joint_key: tuple[Any, ...] = ()
+        self._joined: JointMap | None = None
         self._refusals: dict[str, int] = {}
         self._tried: dict[str, tuple[int, int, int, int]] = {}  # step, own number, life and number of the other
         self._outbox: list[bytes] = []
@@ -149,11 +149,14 @@ class RobotSlam:
         return report
 
     def share(self) -> None:
-        """Publish the map now: `outbox` then returns it, and no older one."""
+        """Publish the map now, if it has been smoothed once: `outbox` then returns it, and no older one."""
+        smoother = self.filter.rejuvenation
+        if smoother is None or smoother.graph is None:
+            return
         self._number += 1
         self._own = SharedMap.of(
             self.name, self.life, self._number, self.filter.next_step, self.filter.pose(),
-            self.filter.map(min_count=self._min_count), tuple(self._links.values()),
+            self.filter.map(min_count=self._min_count), smoother.graph, tuple(self._links.values()),
         )  # fmt: skip
         self.dropped += len(self._outbox)
         self._outbox = messages_of(self._own, self._key)
@@ -205,10 +208,10 @@ class RobotSlam:
             del self._links[other.robot]
         if found.success:
             self._refusals[other.robot] = 0
-            self._links[other.robot] = Link(
-                other=other.robot, life=other.life, motion=found.transform, covariance=found.covariance,
-                inliers=len(found.inliers),
-            )  # fmt: skip
+            rows = found.inliers
+            assert self._own is not None
+            pairs = np.column_stack([self._own.ids[rows[:, 0]], other.ids[rows[:, 1]]])
+            self._links[other.robot] = Link(other=other.robot, life=other.life, motion=found.transform, pairs=pairs)
             if before is None:
                 return "linked"
             return "moved" if _differ(before.motion, found.transform) else "kept"
@@ -222,79 +225,68 @@ class RobotSlam:
 
     def _known_links(self) -> dict[tuple[str, str], Link]:
         """Return the link of each pair of robots: that of the one whose name comes first, if it has one."""
-        lives = {name: shared.life for name, shared in self._inbox.maps.items()} | {self.name: self.life}
-        published = {name: shared.links for name, shared in self._inbox.maps.items()}
-        published[self.name] = () if self._own is None else tuple(self._links.values())
+        known = {name: shared for name, shared in self._inbox.maps.items() if len(shared.ids)}
+        if self._own is not None:
+            known[self.name] = self._own
         found: dict[tuple[str, str], Link] = {}
-        for by in sorted(published, reverse=True):
-            for link in published[by]:
-                if lives.get(link.other) == link.life:
+        for by in sorted(known, reverse=True):
+            for link in known[by].links:
+                if link.other in known and known[link.other].life == link.life:
                     pair = (by, link.other) if by < link.other else (link.other, by)
-                    found[pair] = link if by < link.other else _inverted(link, by, lives[by])
+                    found[pair] = link if by < link.other else link.inverted(by, known[by].life)
         return found
 
-    def _tree(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return motion and covariance from each robot of the group to this one, along the strongest links.
-
-        The links are those of the spanning tree with the most common landmarks: the same for all robots of the group.
-        """
-        links = sorted(self._known_links().items(), key=lambda item: (-item[1].inliers, item[0]))
-        part = {name: name for pair, _ in links for name in pair}
-
-        def root(name: str) -> str:
-            while part[name] != name:
-                name = part[name]
-            return name
-
-        near: dict[str, list[tuple[str, FloatArray, FloatArray]]] = {name: [] for name in part}
-        for (one, other), link in links:
-            if root(one) != root(other):
-                part[root(one)] = root(other)
-                back = _inverted(link, one, 0)
-                near[one].append((other, link.motion, link.covariance))
-                near[other].append((one, back.motion, back.covariance))
-        placed = {self.name: (np.zeros(3), np.zeros((3, 3)))}
-        waiting = [self.name]
-        for name in waiting:
-            motion, covariance = placed[name]
-            for other, step, spread in near.get(name, ()):
-                if other not in placed:
-                    placed[other] = _composed(motion, covariance, step, spread)
-                    waiting.append(other)
-        return placed
+    def _joint(self) -> JointMap | None:
+        """Return the joint map of the group as published; None before the own map is."""
+        if self._own is None:
+            return None
+        links = self._known_links()
+        known = {self.name: self._own} | self._inbox.maps
+        key = (*((name, known[name].life, known[name].number) for name in sorted(known)), *links)
+        if key != self._joint_key:
+            camera, smoothing = self.filter.packed_camera, self.filter.options.smoothing
+            self._joint_key, self._joined = key, joint_map(self.name, known, links, camera, smoothing, self._alignment)
+        return self._joined
 
     # ------------------------------------------------------------------ estimates
 
     @property
     def group(self) -> tuple[str, ...]:
         """Names of the robots whose maps are placed in the frame of this one, itself among them, in order."""
-        return tuple(sorted(self._tree()))
+        return tuple(sorted(self.starts()))
 
     def starts(self) -> dict[str, FloatArray]:
         """Return the start poses (3,) [m, m, rad] of the group, start frame of this robot."""
-        return {name: motion.copy() for name, (motion, _) in self._tree().items()}
+        joint = self._joint()
+        return {self.name: np.zeros(3)} if joint is None else {name: pose.copy() for name, pose in joint.starts.items()}
 
     def poses(self) -> dict[str, PoseEstimate]:
         """Return the poses of the group, start frame of this robot: its own, and the last that others told."""
-        poses = {self.name: self.filter.pose()}
-        for name, (motion, covariance) in self._tree().items():
-            if name != self.name:
-                told = self._inbox.maps[name]
-                poses[name] = PoseEstimate(*_composed(motion, covariance, told.pose, told.pose_covariance))
-        return poses
+        own, joint = self.filter.pose(), self._joint()
+        if joint is None:
+            return {self.name: own}
+        told = {name: PoseEstimate(each.pose, each.pose_covariance) for name, each in self._inbox.maps.items()}
+        told[self.name] = own
+        return {
+            name: PoseEstimate(compose(moved, told[name].mean), rotate_covariances(moved[2], told[name].covariance))
+            for name, moved in joint.corrections.items()
+        }
 
     def map(self, min_count: int = 1) -> LandmarkMap:
-        """Return the map of the group, start frame of this robot: its own present map, fused with those of others.
+        """Return the map of the group, start frame of this robot: as published, with its own latest landmarks.
 
         Args:
-            min_count: Least number of measurements of the own landmarks.
+            min_count: Least number of measurements of the latest landmarks.
         """
-        fused = self.filter.map(min_count=min_count)
-        for name, (motion, covariance) in self._tree().items():
-            if name != self.name and len(self._inbox.maps[name].ids):
-                landmarks = self._inbox.maps[name].landmarks()
-                fused = fuse_maps(fused, landmarks, _known(fused, landmarks, motion, covariance, self._alignment))
-        return fused
+        present, joint = self.filter.map(min_count=min_count), self._joint()
+        if joint is None or len(joint.starts) == 1:
+            return present
+        latest = present.subset(~np.isin(present.ids, joint.own_ids)).moved(joint.corrections[self.name])
+        parts = [[getattr(each, name) for name in FIELDS] for each in (joint.landmarks, latest)]
+        joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+        (clash,) = np.isin(joint.landmarks.ids, latest.ids).nonzero()  # others' landmarks with an id used since
+        joined[FIELDS.index("ids")][clash] = 1 + joined[FIELDS.index("ids")].max() + np.arange(len(clash))
+        return unchecked_map(*joined)
 
     # ------------------------------------------------------------------ files
 
@@ -322,17 +314,11 @@ class RobotSlam:
             ValueError: If there is no such file, or it is damaged or of another version.
         """
         found = read_state(path, MAGIC, RobotSlam, "RobotSlam.save")
-        state = accepted(RobotSlam, str(path), found)
-        robot = cls(state["name"], team=team, life=state["life"])
+        state = accepted(RobotSlam, str(path), found, ONE_ROBOT)
+        robot = cls(state["name"], team=team, life=state["life"])  # with options to be replaced
         restore(robot, state)
         robot._number += MOST_LOST
         return robot
-
-    @staticmethod
-    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
-        """Refuse the filter of several robots."""
-        if len(parts["filter"]["poses"]) != 1:
-            raise ValueError("a filter of several robots")
 
 
 def _key(team: str) -> bytes:
@@ -340,38 +326,7 @@ def _key(team: str) -> bytes:
     return hashlib.sha256(check_kind("team", team, str, "Give a word that all robots share.").encode()).digest()
 
 
-def _known(
-    one: LandmarkMap, other: LandmarkMap, motion: FloatArray, covariance: FloatArray, options: AlignmentOptions
-) -> Alignment:
-    """Return an alignment with a known motion: the pairs of landmarks that it takes to each other."""
-    matches, _ = candidates(one, other, options)
-    inside = inlier_mask(match_table(one, other, matches), matches, motion, options.position_floor**2,
-                         options.position_gate)  # fmt: skip
-    x, y, turn = motion
-    return Alignment(True, "", x, y, turn, covariance, matches[inside], 0.0)
-
-
 def _differ(one: FloatArray, other: FloatArray) -> bool:
     """Return whether two motions count as different."""
     x, y, turn = compose(inverse(one), other)
     return bool(np.hypot(x, y) > DISTINCT_TRANSLATION or abs(turn) > DISTINCT_ROTATION)
-
-
-def _composed(
-    motion: FloatArray, covariance: FloatArray, step: FloatArray, spread: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the composition of two uncertain motions, to first order."""
-    by_first, by_second = np.eye(3), np.eye(3)
-    by_second[:2, :2] = rotation(motion[2])
-    by_first[:2, 2] = rotation(motion[2] + 0.5 * np.pi) @ step[:2]
-    return compose(motion, step), by_first @ covariance @ by_first.T + by_second @ spread @ by_second.T
-
-
-def _inverted(link: Link, by: str, life: int) -> Link:
-    """Return a link as seen from the other robot."""
-    motion = inverse(link.motion)
-    jacobian = np.eye(3)
-    jacobian[:2, :2] = rotation(motion[2])
-    jacobian[:2, 2] = rotation(motion[2] - 0.5 * np.pi) @ link.motion[:2]
-    return Link(other=by, life=life, motion=motion, covariance=jacobian @ link.covariance @ jacobian.T,
-                inliers=link.inliers)  # fmt: skip
