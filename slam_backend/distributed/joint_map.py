@@ -105,7 +105,8 @@ def _joined(
         found = optimize(graph, camera, options)
         if not found.reason:
             poses, places, mode = found.poses, found.landmarks, found
-    starts, corrections = {}, {}
+    starts: dict[str, FloatArray] = {}
+    corrections: dict[str, FloatArray] = {}
     for row, other in enumerate(names):
         own = known[other].graph
         for keys, mine, into in (

@@ -83,7 +83,7 @@ class SharedMap:
         means, covariances: (n, 3) float32 [m], (n, 3, 3) float64 [m^2], own start frame.
         descriptors: (n, d) float32.
         counts, ids: (n,) int64.
-        graph: What the robot's measurements say of its path and landmarks, condensed; ids are those of the map.
+        graph: Condensed measurements of the path and the landmarks, whose ids are those of the map.
         links: Alignments that it found between its map and those of others.
     """
 
