@@ -1,19 +1,13 @@
 """Snapshots of environments: version, validation and file format."""
 
 import dataclasses
-import hashlib
 from collections.abc import Mapping, Sequence
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from slam_backend.core.files import os_errors_as_argument_errors, read_file, write_file
 from slam_backend.core.validation import argument_error
 from slam_backend.state import Child, Dict, Each, Int, Maybe, Options, Seed, Sizes, State, Text, built_options, refuse
-from slam_backend.state.codec import ForeignObjectError, decode, encode
-from slam_backend.state.format import format_of
+from slam_backend.state.files import check_version, read_state, version_of, write_state
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardTerm, is_named
 from vslam_env.simulation.controllers import ActionExecutor
@@ -41,14 +35,9 @@ class EnvParts:
     )
 
 
-@cache
 def state_version() -> str:
     """Return the version of states: number of their format and package version; both must agree to continue."""
-    try:
-        package = version("vslam-env")
-    except PackageNotFoundError:  # not installed: run from a source tree
-        package = "source"
-    return f"{format_of(EnvParts)}/{package}"
+    return version_of(EnvParts)
 
 
 def snapshot_objects(source: WorldSource, terms: Sequence[RewardTerm]) -> dict[str, str]:
@@ -113,17 +102,7 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
         ValueError: If it is not a state of this version, or the file cannot be written.
     """
     _checked("state", state)
-    path = _checked_path(path)
-    try:
-        body = encode(dict(state))
-    except ForeignObjectError as error:
-        hint = "Your own objects are not stored: make the environment that loads the state with them."
-        raise argument_error("state", "numbers, arrays and configurations of this package", str(error), hint) from error
-    with os_errors_as_argument_errors(path, "path"):
-        is_not_file = path.exists() and not path.is_file()
-    if is_not_file:
-        raise argument_error("path", "a file that can be written", Path(path), "The path exists and is not a file.")
-    write_file(path, MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
+    write_state(path, MAGIC, EnvParts, dict(state))
 
 
 def load_state(path: str | Path) -> EnvState:
@@ -132,41 +111,7 @@ def load_state(path: str | Path) -> EnvState:
     Raises:
         ValueError: If the file does not exist, contains no state, is damaged, or has another version.
     """
-    path = _checked_path(path)
-    try:
-        content = read_file(path)
-    except OSError as error:
-        raise argument_error("path", "a state file", Path(path), f"The system says: {error}.") from error
-    head, _, body = content.partition(b"\n")
-    if not head.startswith(MAGIC):
-        raise argument_error("path", "a state file", Path(path), "Write one with save_state.")
-    _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before decoding
-    digest, _, body = body.partition(b"\n")
-    if digest.decode(errors="replace") != _fingerprint(body):
-        raise argument_error("path", "an intact state file", f"a damaged file {path}", "Save it again.")
-    try:
-        state = decode(body)
-    except ValueError as error:
-        hint = f"Save it again; the reader says: {error}."
-        raise argument_error("path", "a readable state file", Path(path), hint) from error
-    return dict(_checked(str(path), state))
-
-
-def _fingerprint(body: bytes) -> str:
-    return hashlib.sha256(body).hexdigest()
-
-
-def _checked_path(path: Any) -> Path:
-    """Return a valid file path, or raise."""
-    if not isinstance(path, (str, PathLike)) or "\0" in str(path):
-        raise argument_error("path", "the path of a file", path, "Give a string or a Path without NUL characters.")
-    return Path(path)
-
-
-def _check_version(name: str, found: Any) -> None:
-    if found != state_version():
-        hint = "Use the version that made it; only the same version continues exactly."
-        raise argument_error(name, f"a state of version {state_version()!r}", found, hint)
+    return dict(_checked(str(path), read_state(path, MAGIC, EnvParts, "save_state")))
 
 
 def _checked(name: str, state: Any) -> Mapping[str, Any]:
@@ -175,7 +120,7 @@ def _checked(name: str, state: Any) -> Mapping[str, Any]:
     if not isinstance(state, Mapping):
         raise argument_error(name, expected, f"a {type(state).__name__}", hint)
     if "version" in state:
-        _check_version(name, state["version"])
+        check_version(EnvParts, name, state["version"])
     for key in EnvParts.STATE.parts:
         if key not in state:
             raise argument_error(name, expected, f"a mapping without {key!r}", hint)

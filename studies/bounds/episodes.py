@@ -102,16 +102,21 @@ def record_episode(env: ExplorationEnv, policies: Mapping[str, Policy] | Guarded
     )  # fmt: skip
 
 
+def new_team(episode: RecordedEpisode, options: FilterOptions) -> TeamSlam:
+    """Return the team of an episode before its first step, with given options of the filters."""
+    belief = episode.config.belief
+    seed = np.random.SeedSequence(episode.belief_seed.entropy, spawn_key=episode.belief_seed.spawn_key)
+    schedule, merging = merge_options(belief, attempts=True)
+    chosen = {field.name: getattr(options, field.name) for field in fields(FilterOptions)}
+    return TeamSlam(len(episode.true_paths), belief.alignment, seed, schedule, merging, **chosen)
+
+
 def replay(episode: RecordedEpisode, options: FilterOptions) -> FilterTrack:
     """Run new filters with given options on the readings of an episode.
 
     With the options of the episode's own filters they repeat its estimates exactly.
     """
-    config, count = episode.config, len(episode.true_paths)
-    seed = np.random.SeedSequence(episode.belief_seed.entropy, spawn_key=episode.belief_seed.spawn_key)
-    schedule, merging = merge_options(config.belief, attempts=True)
-    chosen = {field.name: getattr(options, field.name) for field in fields(FilterOptions)}
-    team = TeamSlam(count, config.belief.alignment, seed, schedule, merging, **chosen)
+    team, count = new_team(episode, options), len(episode.true_paths)
     points, labels = TeamPoses(count), _Labels(count)
     paths, covariances, seconds = [], [], 0.0
     for tick in episode.readings:

@@ -19,7 +19,7 @@ import typer
 
 FILE = Path(__file__).with_name("public_api.txt")
 PACKAGES = (
-    "slam_backend", "slam_backend.frontend", "slam_backend.metrics",
+    "slam_backend", "slam_backend.distributed", "slam_backend.frontend", "slam_backend.metrics",
     "vslam_env", "vslam_env.navigation", "vslam_env.sensors", "vslam_env.world", "vslam_env.rendering",
     "agents",
 )  # fmt: skip
