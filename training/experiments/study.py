@@ -138,6 +138,10 @@ class ResultTable:
     note: str = ""
     words: Words = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        titles = [column.title for column in self.columns]
+        assert len(set(titles)) == len(titles), f"{self.name}: two columns with one heading: {titles}"
+
     @property
     def headings(self) -> list[str]:
         """Headings of all columns."""

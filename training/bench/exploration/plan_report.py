@@ -87,10 +87,7 @@ def tables(plan: Plan, rows: Rows) -> list[ResultTable]:
         ),
         ResultTable(
             name="worlds", title="E in each world [cm]", **each, **is_played,
-            columns=tuple(
-                _e_column(_place(plan, track, family, robots), track=track, family=family, robots=robots)
-                for track, family, robots in grouped(played, WORLD[:-1])
-            ),
+            columns=tuple(_e_column(heading, **where) for heading, where in _places(plan, played).items()),
         ),
         ResultTable(
             name="limits", title="What each limit costs", each=("track",), by=("track", "relaxation"),
@@ -250,6 +247,11 @@ def _title(plan: Plan, track: str) -> str:
     return f"{track}: {plan.all_tracks[track].title}"
 
 
-def _place(plan: Plan, track: str, family: str, robots: int) -> str:
-    """Return the heading of a world of a track, and of a number of robots where the track has several."""
-    return family if len(plan.all_tracks[track].robots) == 1 else f"{family}, K={robots}"
+def _places(plan: Plan, rows: Rows) -> dict[str, dict[str, Any]]:
+    """Return which rows are of each kind of world, by heading; of a number of robots where a track has several."""
+    found: dict[str, dict[str, Any]] = {}
+    for track, family, robots in grouped(rows, WORLD[:-1]):
+        several = len(plan.all_tracks[track].robots) > 1
+        where = {"family": family} | ({"robots": robots} if several else {})
+        found[f"{family}, K={robots}" if several else family] = where
+    return found
