@@ -45,6 +45,7 @@ class Config(losses.Config):
     )  # fmt: skip
     delays: tuple[Seconds, ...] = option((0.0,), "Times that messages take [s].", hint="Give seconds.")
     lost: tuple[Share, ...] = option((0.0,), "Shares of messages that are lost.", hint="Give shares below 1.")
+    copies: int = option(1, "How often each message is sent.", ge=1, le=SHARE_EVERY, hint="Use 1 to 50.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +79,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     """
     episode = recorded(config, trial)
     count, seconds = len(episode.true_paths), TICK * len(episode.readings)
-    robots, sent = _robots(episode, trial)
+    robots, sent = _robots(episode, trial, config.copies)
     team = new_team(episode, episode.config.belief.filter)
     for tick in episode.readings:
         contacts = None if tick[0].contacts is None else np.stack([own.contacts for own in tick])  # type: ignore[misc]
@@ -113,13 +114,13 @@ def _mean(errors: list[tuple[float, float]], column: int) -> float:
     return float(np.mean([row[column] for row in errors]))
 
 
-def _robots(episode: RecordedEpisode, trial: Trial) -> tuple[list[RobotSlam], int]:
+def _robots(episode: RecordedEpisode, trial: Trial, copies: int) -> tuple[list[RobotSlam], int]:
     """Return robots that read an episode and hear those in contact, and the bytes that they sent."""
     count, rng = len(episode.true_paths), np.random.default_rng(trial.seed)
     belief = episode.config.belief
     options = {field.name: getattr(belief.filter, field.name) for field in fields(FilterOptions)}
     robots = [
-        RobotSlam(f"robot {k}", seed=k, share_every=SHARE_EVERY, alignment=belief.alignment, **options)
+        RobotSlam(f"robot {k}", seed=k, share_every=SHARE_EVERY, copies=copies, alignment=belief.alignment, **options)
         for k in range(count)
     ]
     on_the_way: deque[tuple[float, int, bytes]] = deque()

@@ -72,6 +72,7 @@ class RobotSlam:
         share_every: Steps between two publications of the map; it is published after the first rejuvenation.
         attempt_every: Steps between two attempts to align the map with one of those received.
         min_count: Least number of measurements of the landmarks that it publishes.
+        copies: How often each message is sent, spread over `share_every`, for transports that lose some.
         alignment: Options of alignments.
         **options: Fields of `FilterOptions`.
 
@@ -86,7 +87,7 @@ class RobotSlam:
     """
 
     STATE = State(
-        name=Text(), life=Int(), share_every=Int(1), attempt_every=Int(1), min_count=Int(1),
+        name=Text(), life=Int(), share_every=Int(1), attempt_every=Int(1), min_count=Int(1), copies=Int(1),
         alignment=Options(AlignmentOptions), filter=Child(FastSlam), inbox=Child(Inbox), own=Maybe(Record(SharedMap)),
         number=Int(), links=Dict(Text(), Record(Link)), refusals=Dict(Text(), Int()),
         tried=Dict(Text(), Row(Int(), Int(), Int(), Int())), refused=Int(), dropped=Int(),
@@ -94,8 +95,8 @@ class RobotSlam:
 
     def __init__(
         self, name: str, *, team: str = "team", life: int = 0, seed: int | np.random.SeedSequence = 0,
-        share_every: int = 50, attempt_every: int = 25, min_count: int = 2, alignment: AlignmentOptions | None = None,
-        **options: Any,
+        share_every: int = 50, attempt_every: int = 25, min_count: int = 2, copies: int = 1,
+        alignment: AlignmentOptions | None = None, **options: Any,
     ) -> None:  # fmt: skip
         if not isinstance(name, str) or not 0 < len(name.encode()) <= MOST_NAME:
             raise argument_error("name", f"a name of 1 to {MOST_NAME} bytes", name, "Give each robot a short name.")
@@ -105,6 +106,8 @@ class RobotSlam:
         self._share_every = check_int("share_every", share_every, 1, hint)
         self._attempt_every = check_int("attempt_every", attempt_every, 1, hint)
         self._min_count = check_int("min_count", min_count, 1, "Use 1 to publish all landmarks.")
+        hint = "Use 1 for a transport that loses nothing, at most share_every."
+        self._copies = check_int("copies", copies, 1, hint, share_every)
         self._alignment = (
             AlignmentOptions() if alignment is None else check_kind("alignment", alignment, AlignmentOptions)
         )
@@ -120,6 +123,7 @@ class RobotSlam:
         self._joined: JointMap | None = None
         self._refusals: dict[str, int] = {}
         self._tried: dict[str, tuple[int, int, int, int]] = {}  # step, own number, life and number of the other
+        self._messages: list[bytes] = []  # of the latest map
         self._outbox: list[bytes] = []
         self.events: list[LinkEvent] = []
         self.refused = self.dropped = 0
@@ -144,6 +148,8 @@ class RobotSlam:
         steps = self.filter.next_step
         if steps % self._share_every == 0:
             self.share()
+        elif any(steps % self._share_every == k * self._share_every // self._copies for k in range(1, self._copies)):
+            self._outbox += self._messages
         if steps % self._attempt_every == 0:
             self.attempt()
         return report
@@ -159,10 +165,11 @@ class RobotSlam:
             self.filter.map(min_count=self._min_count), smoother.graph, tuple(self._links.values()),
         )  # fmt: skip
         self.dropped += len(self._outbox)
-        self._outbox = messages_of(self._own, self._key)
+        self._messages = messages_of(self._own, self._key)
+        self._outbox = self._messages.copy()
 
     def outbox(self) -> list[bytes]:
-        """Return the messages to all others since the last call: those of the latest map alone."""
+        """Return the messages to all others since the last call, of the latest map alone."""
         messages, self._outbox = self._outbox, []
         return messages
 

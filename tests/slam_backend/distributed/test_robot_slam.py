@@ -250,6 +250,19 @@ def test_only_the_latest_map_waits_to_be_sent(met: Any) -> None:
     assert robot.outbox() == []
 
 
+def test_copies_of_messages_are_spread_over_time(met: Any) -> None:
+    """With three copies each message is sent three times before the next map, not at once."""
+    simulation = SimulatedTeam(1, seed=5)
+    (robot,) = robots_of(simulation, copies=3)
+    sent = []
+    for _ in range(29):
+        odometry, frames = simulation.read()
+        robot.step(odometry[0], frames[0])
+        sent.append(robot.outbox())
+    assert [step for step, messages in enumerate(sent, start=1) if messages and step >= 20] == [20, 23, 26]
+    assert sent[19] == sent[22] == sent[25]
+
+
 def test_a_team_has_at_most_so_many_robots() -> None:
     """Robots beyond the limit are refused in one line, so that memory is bounded."""
     robot, key = RobotSlam("ada", num_particles=5), RobotSlam("ada", num_particles=5)._key
@@ -299,6 +312,7 @@ def test_a_link_that_later_maps_contradict_is_undone(met: Any) -> None:
         ({"name": "x" * 65}, "name: expected a name of 1 to 64 bytes"),
         ({"life": -1}, "life: expected an int"),
         ({"share_every": 0}, "share_every: expected an int"),
+        ({"share_every": 2, "copies": 3}, "copies: expected an int"),
         ({"team": 7}, "team: expected a str"),
         ({"alignment": 3}, "alignment: expected"),
         ({"num_particles": 0}, "num_particles: expected"),
