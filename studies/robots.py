@@ -45,7 +45,7 @@ class Config(losses.Config):
     )  # fmt: skip
     delays: tuple[Seconds, ...] = option((0.0,), "Times that messages take [s].", hint="Give seconds.")
     lost: tuple[Share, ...] = option((0.0,), "Shares of messages that are lost.", hint="Give shares below 1.")
-    copies: int = option(1, "How often each message is sent.", ge=1, le=SHARE_EVERY, hint="Use 1 to 50.")
+    copies: int = option(1, "Number of times that each message is sent.", ge=1, le=SHARE_EVERY, hint="Use 1 to 50.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

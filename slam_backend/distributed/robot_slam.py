@@ -72,7 +72,7 @@ class RobotSlam:
         share_every: Steps between two publications of the map; it is published after the first rejuvenation.
         attempt_every: Steps between two attempts to align the map with one of those received.
         min_count: Least number of measurements of the landmarks that it publishes.
-        copies: How often each message is sent, spread over `share_every`, for transports that lose some.
+        copies: Number of times that each message is sent, spread over `share_every`, for transports that lose some.
         alignment: Options of alignments.
         **options: Fields of `FilterOptions`.
 
