@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tomli_w
 
+import agents
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import argument_error
 from training.bench.exploration.episodes import PACKED, episodes_csv
@@ -16,6 +17,7 @@ from training.bench.exploration.verification import VERIFIED_FILE
 from training.experiments.run_folder import CONFIG_FILE, check_free
 
 SUBMISSION = "submission.toml"
+OWN = Path(agents.__file__).parent  # policies of this project are named by their digests alone
 
 
 def submit(folder: Path, out: Path) -> Results:
@@ -47,7 +49,8 @@ def submit(folder: Path, out: Path) -> Results:
                 hint = "Restore the file, or play again in a new folder."
                 raise argument_error("folder", f"the file of {label(policy)!r} as it was played", str(file), hint)
             about[policy]["file"] = file.name
-            contents[file.name] = content
+            if not file.is_relative_to(OWN):
+                contents[file.name] = content
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     card = {"plan": results.plan.name, "plan_hash": results.plan.digest, "policies": about, "files": digests}
     out.mkdir(parents=True, exist_ok=True)
