@@ -192,7 +192,7 @@ def _intact(path: Path) -> Iterator[None]:
     except Exception as error:
         if is_argument_error(error):
             raise
-        words = " ".join(str(error).split()) or type(error).__name__
+        words = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         hint = f"Repair {str(path)!r} with rosbag reindex, ros2 bag reindex or mcap recover, or record it again."
         raise argument_error("path", "an intact bag", f"a damaged one: {words}", hint) from error
 

@@ -96,6 +96,7 @@ class _Driven(NamedTuple):
     first: float  # [s]
     last: float  # [s]
     base: str  # Frame of the robot
+    fixed: frozenset[str]  # Frames in which its poses are
 
 
 class _Seen(NamedTuple):
@@ -304,8 +305,8 @@ def _rotations(argument: str, topic: str, quaternions: FloatArray) -> tuple[Floa
 
 def _read_poses(
     bag: Bag, argument: str, topic: str, base: str | None, statics: Mapping[str, tuple[str, Motion]], notes: list[str]
-) -> tuple[Trajectory, str]:
-    """Return the planar poses of a topic, of the base if it is known, and the name of the base."""
+) -> tuple[Trajectory, str, frozenset[str]]:
+    """Return the planar poses of a topic, of the base if it is known, the name of the base, and frames of the poses."""
     parse = POSES[check_type(argument, topic, bag.check_topic(argument, topic).kind, POSES)]
     readings: list[PoseReading] = [parse(message) for message in bag.messages(argument, topic)]
     times, rows = _times(argument, topic, [each.stamp for each in readings], notes)
@@ -321,6 +322,7 @@ def _read_poses(
         rotations = rotations @ mount.rotation
     elif child and base and child != base:
         notes.append(f"{topic}: poses of {child!r}, taken for those of {base!r}.")
+    frames = frozenset(each.frame for each in readings if each.frame)
     tilts = np.arccos(np.clip(rotations[:, 2, 2], -1.0, 1.0))
     if (tilted := np.flatnonzero(tilts > MOST_TILT)).size:
         row = int(tilted[0])
@@ -331,7 +333,7 @@ def _read_poses(
     headings = np.arctan2(rotations[kept, 1, 0], rotations[kept, 0, 0])
     if len(kept) < 2:
         raise argument_error(argument, f"two poses of {topic} or more", "a single one", "Record for a longer time.")
-    return Trajectory(times[kept], np.column_stack([positions[kept, :2], headings])), base
+    return Trajectory(times[kept], np.column_stack([positions[kept, :2], headings])), base, frames
 
 
 def _read_odometry(
@@ -340,7 +342,7 @@ def _read_odometry(
     """Return the odometry of a topic of poses or of velocities."""
     kind = check_type("odometry", topic, bag.check_topic("odometry", topic).kind, (*POSES, *TWISTS))
     if kind in POSES:
-        path, child = _read_poses(bag, "odometry", topic, base, statics, notes)
+        path, child, frames = _read_poses(bag, "odometry", topic, base, statics, notes)
         gaps = np.diff(path.times)
         if gaps.max() > HOLD:
             count = int(np.count_nonzero(gaps > HOLD))
@@ -349,7 +351,7 @@ def _read_odometry(
         def pose_at(wanted: FloatArray) -> FloatArray:
             return path.at(np.clip(wanted, path.times[0], path.times[-1]))
 
-        return _Driven(pose_at, float(path.times[0]), float(path.times[-1]), child)
+        return _Driven(pose_at, float(path.times[0]), float(path.times[-1]), child, frames)
     twists = [TWISTS[kind](message) for message in bag.messages("odometry", topic)]
     times, rows = _times("odometry", topic, [each.stamp for each in twists], notes)
     commands = np.column_stack([times, [(twists[row].forward, twists[row].turn) for row in rows]])
@@ -362,7 +364,8 @@ def _read_odometry(
     def integrated(wanted: FloatArray) -> FloatArray:
         return integrate_commands(commands, wanted)
 
-    return _Driven(integrated, float(times[0]), float(times[-1]), twists[0].frame if base is None else base)
+    frame = twists[0].frame if base is None else base
+    return _Driven(integrated, float(times[0]), float(times[-1]), frame, frozenset())
 
 
 # ---- landmarks
@@ -395,6 +398,9 @@ def _read_landmarks(
     stamps, rows = _times("landmarks", topic, [each.stamp for each in sightings], notes)
     _check_overlap("landmarks", topic, stamps, driven)
     parts = [sightings[row] for row in rows]
+    if fixed := sorted({each.frame for each in parts} & driven.fixed - {driven.base}):
+        hint = "Give what a sensor of the robot reads, not a map."
+        raise argument_error("landmarks", f"landmarks of {topic} in a frame of the robot", fixed[0], hint)
     mounts = {
         sensor: _mounting("landmarks", topic, statics, driven.base, sensor, notes)
         for sensor in dict.fromkeys(each.frame for each in parts)

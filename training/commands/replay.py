@@ -124,19 +124,21 @@ def replay_stereo(call: Call[ImagesConfig]) -> None:
 def replay_bag(call: Call[BagConfig]) -> None:
     """Replay a bag of ROS 1 or ROS 2 (extra ros): odometry, and landmarks with identities or descriptors.
 
-    Without --odometry or --landmarks its topics are listed. Several comma-separated topics are several robots, a team
+    Without --odometry and --landmarks its topics are listed. Several comma-separated topics are several robots, a team
     with unknown starts.
     """
     from slam_backend.core.validation import argument_error
     from training.replay.readers import read_bag
 
     config = call.config
-    for name in ("odometry", "landmarks"):
-        if getattr(config, name) is None:
-            _list_topics(call.console, config.path)
-            hint = f"Choose a topic above that can be {name}."
-            raise argument_error(name, f"the topic of the {name}", f"no --{name}", hint)
-    _replay(call, config, read_bag)
+    missing = [name for name in ("odometry", "landmarks") if getattr(config, name) is None]
+    if missing:
+        _list_topics(call.console, config.path)
+    if len(missing) == 1:
+        hint = f"Choose a topic above that can be {missing[0]}."
+        raise argument_error(missing[0], f"the topic of the {missing[0]}", f"no --{missing[0]}", hint)
+    if not missing:
+        _replay(call, config, read_bag)
 
 
 def _list_topics(console: Console, path: str) -> None:
@@ -145,7 +147,9 @@ def _list_topics(console: Console, path: str) -> None:
 
     from slam_backend.readers.bags import bag_topics
 
-    table = Table("topic", "type", "messages", "can be")
+    table = Table("topic", "type", "messages", "can be", box=None)
+    for column in table.columns[:2]:
+        column.no_wrap = True
     for topic, kind, count, use in bag_topics(path):
         table.add_row(topic, kind or "several", str(count), use or "-")
     console.print(table)

@@ -157,11 +157,9 @@ class BagConfig(ReplayConfig):
         ..., "Bag: .bag of ROS 1; .mcap, .db3 or folder of ROS 2.", shown="none", hint="Give --path.", is_path=True
     )
     odometry: tuple[str, ...] | None = option(
-        None, "Topic of the odometry, comma-separated for several robots; without it topics are listed.", shown="none"
+        None, "Topic of the odometry, comma-separated for several robots; without both topics are listed.", shown="none"
     )
-    landmarks: tuple[str, ...] | None = option(
-        None, "Topic of the landmarks, one for each robot; without it topics are listed.", shown="none"
-    )
+    landmarks: tuple[str, ...] | None = option(None, "Topic of the landmarks, one for each robot.", shown="none")
     truth: tuple[str, ...] | None = option(None, "Topic of the true poses, one for each robot.", shown="none")
     camera: str | None = option(None, "Topic of the CameraInfo of all robots, for their field of view.", shown="none")
     base: tuple[str, ...] | None = option(

@@ -298,6 +298,7 @@ def _write_refused(path: Path) -> None:
             bag.write("/unstamped", view.time, bags.tags(bag, view._replace(time=-1.0)))
             bag.write("/other_clock", view.time, bags.tags(bag, view._replace(time=view.time + 5000.0)))
             bag.write("/elsewhere", view.time, bags.tags(bag, view, "gripper"))
+            bag.write("/mapped", view.time, bags.tags(bag, view, "odom"))
             bag.write("/frames", view.time, bags.frames(bag, view))
             bag.write("/odd", view.time, bags.cloud(bag, view, extra={"id": view.ids}))
             bag.write("/bare", view.time, bags.cloud(bag, view))
@@ -329,6 +330,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "back": ({"landmarks": ["/back"]}, r"stamps of /back that go back by at most 1 s, got a stamp 1700000001.0"),
     "no chain": ({"landmarks": ["/elsewhere"]}, r"expected static frames from 'gripper' of /elsewhere to 'base_link', "
                  r"got no such chain. /tf_static has mast, optical: name the robot's frame by --base."),
+    "a map": ({"landmarks": ["/mapped"]}, r"expected landmarks of /mapped in a frame of the robot, got 'odom'"),
     "quaternion": ({"odometry": ["/pose0"]}, r"expected unit quaternions of /pose0, got \[0.0, 0.0, 0.0, 2.0\]"),
     "tilt": ({"odometry": ["/pose1"]}, r"/pose1 tilted by at most 0.2 rad, got a tilt of 0.30 rad at 17000000"),
     "single": ({"odometry": ["/single"]}, r"odometry: expected two poses of /single or more, got a single one"),

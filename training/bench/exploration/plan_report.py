@@ -70,7 +70,7 @@ def tables(plan: Plan, rows: Rows) -> list[ResultTable]:
                 Column("map_recall", "recall [%]", digits=1, factor=CM),
                 Column("map_rmse_m", "RMSE [cm]", digits=1, factor=CM), Column("nees", "NEES", digits=1),
                 Column("right_merges", "merged", digits=2),
-                Column("false_merges", "false", digits=3), Column("undone_merges", "undone", digits=2),
+                Column("false_merges", "false merges", digits=3), Column("undone_merges", "undone", digits=2),
                 Column("last_merge_s", "last [s]", digits=0),
             ),
         ),
