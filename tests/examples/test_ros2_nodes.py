@@ -15,6 +15,7 @@ from builders.teams import SimulatedTeam
 
 from slam_backend import LandmarkMap, Measurements
 from slam_backend.core.validation import FloatArray
+from slam_backend.distributed.messages import messages_of
 from slam_backend.geometry import between, compose, inverse
 from slam_backend.models.camera import StereoCamera
 from vslam_env.navigation import CELL, FREE, OCCUPIED, CandidateKind, cell_of, centre_of
@@ -425,8 +426,8 @@ def test_robots_on_one_topic_end_in_one_group_with_maps_that_agree(stub: Any, tm
     count = len(ada.lines)
     world.parameters = ROBOT | {"name": "eve", "ns": "/eve", "team": "another"}
     eve = scripts.team_node.TeamNode()
-    eve.robot.share()
-    for message in [*eve.robot.outbox(), b"nonsense", b""]:
+    forged = messages_of(ada.robot._own, eve.robot._key)[:1]
+    for message in [*forged, b"nonsense", b""]:
         world.publish(scripts.team_node.SHARED, msg.UInt8MultiArray(data=list(message)))
     assert sorted(ada.lines[count:]) == [
         "message refused: expected a message of a robot, got other bytes",
