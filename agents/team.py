@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from agents.planners.targets import Targets, own_targets, team_targets
+from agents.planners.common.targets import Targets, own_targets, team_targets
 from agents.policy import Policy
 from slam_backend.core.validation import IntArray
 from vslam_env.belief.team_belief import Belief

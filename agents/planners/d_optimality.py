@@ -10,7 +10,7 @@ the path to that of now. Robots leave frontiers to which a teammate is nearer.
 import numpy as np
 
 from agents.goal_choice import SWITCH_RATIO, nearest_own_frontiers
-from agents.planners.predicted_pose import d_optimality, predict_covariances
+from agents.planners.common.predicted_pose import d_optimality, predict_covariances
 from vslam_env.belief.team_belief import Belief
 
 LEAST = 1e-3  # D-optimality below which the pose counts as known: .02 m and .001 rad or so

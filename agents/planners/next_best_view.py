@@ -20,8 +20,8 @@ walls beside the path have their looks without a stop.
 
 import numpy as np
 
+from agents.planners.common.targets import own_targets
 from agents.planners.distance_advantage import advantage_costs
-from agents.planners.targets import own_targets
 from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from agents.goal_choice import SWITCH_RATIO, nearest_own_frontiers
-from agents.planners.predicted_pose import predict_covariances
+from agents.planners.common.predicted_pose import predict_covariances
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CELL
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from training.commands._options import options
-from training.commands._run_folder import Call
-from training.experiments.compilation import prepare
-from training.experiments.console import text_column
+from training.commands.helpers.options import options
+from training.commands.helpers.run_folder import Call
+from training.experiments.output.compilation import prepare
+from training.experiments.output.console import text_column
 from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
@@ -56,7 +56,7 @@ def train(
     weights as an uninterrupted training, even if the process was killed.
     """
     from slam_backend.core.validation import argument_error, check_int
-    from training.experiments.cluster import LostWorkerError, connected
+    from training.experiments.machine.cluster import LostWorkerError, connected
     from training.experiments.run_folder import RunFolder, installed_versions
 
     require_extra()
@@ -123,7 +123,7 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
 
     from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
-    from training.experiments.interrupt import interrupt_flag
+    from training.experiments.machine.interrupt import interrupt_flag
 
     columns = (
         text_column("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None),
@@ -165,7 +165,7 @@ def _imitate_live(console: Console, imitation: "Imitation") -> tuple[bool, float
 
     from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
-    from training.experiments.interrupt import interrupt_flag
+    from training.experiments.machine.interrupt import interrupt_flag
 
     columns = (
         text_column("{task.description}"), BarColumn(None), text_column("{task.fields[status]}"), TimeElapsedColumn(),
@@ -203,7 +203,7 @@ def _epoch_text(rows: "Sequence[Row]") -> str:
 
 def _finish_imitation(call: Call[TrainConfig], imitation: "Imitation", complete: bool, seconds: float) -> None:
     """Write and print the results of the imitation."""
-    from training.experiments.tables import csv_of
+    from training.experiments.output.tables import csv_of
     from training.rl.curves import draw_imitation
 
     rows, console, folder = imitation.rows, call.console, call.folder
@@ -233,7 +233,7 @@ def _rollout_text(row: "Row") -> str:
 
 def _finish(call: Call[TrainConfig], training: "Training", complete: bool, seconds: float) -> None:
     """Write and print the results of the training."""
-    from training.experiments.tables import E_SCALE, csv_of
+    from training.experiments.output.tables import E_SCALE, csv_of
     from training.rl.curves import draw_learning, first_and_last_tenth
 
     rows, console, folder = training.rows, call.console, call.folder
