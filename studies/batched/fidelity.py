@@ -22,7 +22,7 @@ from studies.filters import losses
 from training.bench.exploration.players import parted
 from training.commands.study import run_program
 from training.episodes.guard import GuardedTeam
-from training.experiments.config import NoisePreset, RobotCount, option
+from training.experiments.config import option
 from training.experiments.study import Column, ResultTable, Row, Study
 from training.rl.config import require_extra
 from vslam_env import vslam_v1
@@ -50,16 +50,10 @@ RATIO, RECALL, MAP_ERROR_M, CORRELATION, DELAY_S = 2.0, 0.04, 0.03, 0.9, 10.0
 # ---------------------------------------------------------------------- trials
 
 
-class Config(losses.Config):
+class Config(losses.TeamConfig):
     """Episodes with each estimator."""
 
     seeds: int = option(2, "Number of seeds.", ge=1, hint="Use at least one seed.")
-    presets: tuple[NoisePreset, ...] = option(("standard", "hard"), "Noise presets: easy, standard, hard.")
-    robots: tuple[RobotCount, ...] = option((3,), "Numbers of robots.", hint="Use 1 to 8 robots.")
-    policies: tuple[str, ...] = option(
-        ("next_best_view@continuous",), "Policies of the robots: name, path of a model, MODULE:NAME, or LABEL= and one "
-        "of these; @discrete selects the action type.",
-    )  # fmt: skip
     estimators: tuple[Estimator, ...] = option(get_args(Estimator), "Estimators to compare.", shown="all")
 
     def check(self) -> None:
@@ -88,27 +82,6 @@ def trials(config: Config) -> list[Trial]:
     ]
 
 
-class Played(NamedTuple):
-    """An episode, and its actions by tick."""
-
-    episode: RecordedEpisode
-    actions: Sequence[Mapping[str, Any]]
-
-
-class _Recorder(GuardedTeam):
-    """Policies whose actions are kept."""
-
-    def __init__(self, team: GuardedTeam) -> None:
-        self._inner, self.actions = team, list[Mapping[str, Any]]()
-
-    def reset(self) -> None:
-        self._inner.reset()
-
-    def act_all(self, *given: Any) -> dict[str, Any]:
-        self.actions.append(self._inner.act_all(*given))
-        return dict(self.actions[-1])
-
-
 class _Tape:
     """Team policy that plays actions."""
 
@@ -126,21 +99,18 @@ class _Tape:
         return dict(self._actions[self._tick - 1])
 
 
-def run(environment: EnvConfig, seed: int, policy: str, actions: Sequence[Mapping[str, Any]] | None = None) -> Played:
-    """Run an episode with a policy, or with given actions."""
+def run_again(
+    environment: EnvConfig, seed: int, policy: str, actions: Sequence[Mapping[str, Any]]
+) -> RecordedEpisode:  # fmt: skip
+    """Run an episode with given actions, those of a policy."""
     with closing(vslam_v1.parallel_env(config=environment)) as env:
-        if actions is None:
-            team: GuardedTeam = _Recorder(parted(policy).make(env, losses.LONGEST_DECISION))
-        else:
-            team = GuardedTeam(_Tape(actions), policy, environment.action_type)
-        episode = record_episode(env, team, seed)
-    return Played(episode, team.actions if isinstance(team, _Recorder) else actions or ())
+        return record_episode(env, GuardedTeam(_Tape(actions), policy, environment.action_type), seed)
 
 
 @lru_cache(maxsize=1)
-def exact(config: Config, episode: losses.Trial) -> Played:
+def exact(config: Config, episode: losses.Trial) -> RecordedEpisode:
     """Return an episode of the environment as it is."""
-    return run(losses.environment(config, episode), episode.seed, episode.policy)
+    return losses.recorded(config, episode)
 
 
 @single_threaded_blas
@@ -158,14 +128,14 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     """
     shared = {name: value for name, value in asdict(trial).items() if name != "estimator"}
     whole = exact(config, losses.Trial(**shared))
-    a = _outcome(whole.episode)
+    a = _outcome(whole)
     if trial.estimator == "one Gaussian":
-        b = _gaussian_outcome(gaussian_team(whole.episode), whole.episode)
+        b = _gaussian_outcome(gaussian_team(whole), whole)
     elif trial.estimator == "batched":
-        b = _gaussian_outcome(simulated_team(whole.episode, trial.seed, whole.actions), whole.episode)
+        b = _gaussian_outcome(simulated_team(whole, trial.seed, whole.actions), whole)
     else:
         changed = losses.environment(config, trial).replace(belief={"filter": dict(OPTIONS[trial.estimator])})
-        b = _outcome(run(changed, trial.seed, trial.policy, whole.actions).episode)
+        b = _outcome(run_again(changed, trial.seed, trial.policy, whole.actions))
     return {
         "position_ratio": losses.ratio(b.position, a.position), "map_ratio": losses.ratio(b.landmarks, a.landmarks),
         "recall_change": b.recall - a.recall, "map_error_change": float(np.mean(b.last_errors - a.last_errors)),

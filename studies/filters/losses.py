@@ -98,6 +98,17 @@ class Config(ExperimentConfig):
         return with_absolute_paths(values)
 
 
+class TeamConfig(Config):
+    """Combinations for teams."""
+
+    presets: tuple[NoisePreset, ...] = option(("standard", "hard"), "Noise presets: easy, standard, hard.")
+    robots: tuple[RobotCount, ...] = option((3,), "Numbers of robots.", hint="Use 1 to 8 robots.")
+    policies: tuple[str, ...] = option(
+        ("next_best_view@continuous",), "Policies of the robots: name, path of a model, MODULE:NAME, or LABEL= and one "
+        "of these; @discrete selects the action type.",
+    )  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
     """One episode."""

@@ -4,7 +4,7 @@ python -m studies.merging.robots --presets standard,hard --seeds 5
 """
 
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from itertools import product
 from typing import Annotated, Any
 
@@ -24,7 +24,7 @@ from studies.bounds.episodes import RecordedEpisode, new_team
 from studies.filters import losses
 from studies.filters.losses import checks, recorded
 from training.commands.study import run_program
-from training.experiments.config import NoisePreset, RobotCount, option
+from training.experiments.config import option
 from training.experiments.study import Column, ResultTable, Study
 from vslam_env.config import TICK
 
@@ -34,15 +34,9 @@ Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Seconds = Annotated[float, Field(ge=0.0)]
 
 
-class Config(losses.Config):
+class Config(losses.TeamConfig):
     """Episodes of teams, whose messages may be late or lost."""
 
-    presets: tuple[NoisePreset, ...] = option(("standard", "hard"), "Noise presets: easy, standard, hard.")
-    robots: tuple[RobotCount, ...] = option((3,), "Numbers of robots.", hint="Use 1 to 8 robots.")
-    policies: tuple[str, ...] = option(
-        ("next_best_view@continuous",), "Policies of the robots: name, path of a model, MODULE:NAME, or LABEL= and one "
-        "of these; @discrete selects the action type.",
-    )  # fmt: skip
     delays: tuple[Seconds, ...] = option((0.0,), "Times that messages take [s].", hint="Give seconds.")
     lost: tuple[Share, ...] = option((0.0,), "Shares of messages that are lost.", hint="Give shares below 1.")
     copies: int = option(1, "Number of times that each message is sent.", ge=1, le=SHARE_EVERY, hint="Use 1 to 50.")
@@ -59,7 +53,7 @@ class Trial(losses.Trial):
 def trials(config: Config) -> list[Trial]:
     """Return all trials."""
     return [
-        Trial(**{field.name: getattr(trial, field.name) for field in fields(trial)}, delay=delay, lost=lost)
+        Trial(**asdict(trial), delay=delay, lost=lost)
         for trial, delay, lost in product(losses.trials(config), config.delays, config.lost)
     ]
 

@@ -15,20 +15,15 @@ from studies.bounds.ideal_team import NO_CONTACT, NOT_TRIED, ideal_team, waits_b
 from studies.filters import losses
 from studies.filters.losses import Trial, checks, errors_of, recorded, trials
 from training.commands.study import run_program
-from training.experiments.config import NoisePreset, RobotCount, option
+from training.experiments.config import NoisePreset, option
 from training.experiments.study import Column, ResultTable, Row, Study
 from vslam_env.config import TICK
 
 
-class Config(losses.Config):
+class Config(losses.TeamConfig):
     """Episodes of teams in worlds with hard noise."""
 
     presets: tuple[NoisePreset, ...] = option(("hard",), "Noise presets: easy, standard, hard.")
-    robots: tuple[RobotCount, ...] = option((3,), "Numbers of robots.", hint="Use 1 to 8 robots.")
-    policies: tuple[str, ...] = option(
-        ("next_best_view@continuous",), "Policies of the robots: name, path of a model, MODULE:NAME, or LABEL= and one "
-        "of these; @discrete selects the action type.",
-    )  # fmt: skip
 
 
 @single_threaded_blas

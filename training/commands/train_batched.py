@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from training.commands.helpers.options import options
+from training.commands.helpers.progress import training_bar
 from training.commands.helpers.run_folder import Call
-from training.experiments.output.console import text_column
 from training.rl.batched_config import BatchedTrainConfig
 from training.rl.config import require_extra
 
@@ -71,17 +71,10 @@ def _run_live(call: Call[BatchedTrainConfig], training: "BatchedTraining") -> bo
     Returns:
         Whether the training is complete.
     """
-    from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
     from training.experiments.machine.interrupt import interrupt_flag
 
-    columns = (
-        text_column("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None),
-        text_column("{task.fields[status]}"), TimeElapsedColumn(), text_column("left"), TimeRemainingColumn(),
-    )  # fmt: skip
     config, begin = training.config, time.perf_counter()
-    bar = Progress(*columns, console=call.console, expand=True, speed_estimate_period=300.0)
-    with bar, interrupt_flag() as interrupted:
+    with training_bar(call.console) as bar, interrupt_flag() as interrupted:
         task = bar.add_task("", total=config.updates, completed=len(training.rows), status="compiling")
 
         def is_over() -> bool:

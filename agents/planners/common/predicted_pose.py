@@ -6,10 +6,11 @@ view within `SIGHT` and not behind a wall is measured once every `STEP`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from agents.goal_choice import SWITCH_RATIO, nearest_own_frontiers
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import DistanceMap, cells_of, distance_map, sees
@@ -18,7 +19,23 @@ SIGHT, HALF_VIEW = 6.0, 0.46  # [m], [rad] range and half the angle of view
 STEP = 1.5  # [m] between predicted measurements
 ALONG, ACROSS, TURN = 0.05, 0.02, math.pi / 90.0  # [m/m], [m/m], [rad/m]: assumed noise of the odometry
 RANGE_SIGMA, SIDE_SIGMA = 0.01, 0.01  # [1/m] times the squared range, [m/m] times the range
+MOST_PREDICTED = 6  # nearest candidates whose poses are predicted
 LEAST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])  # [m^2, m^2, rad^2] of a step, so that covariances are invertible
+
+
+def best_of_nearest(
+    belief: Belief, held: int | None, values: Callable[[Belief, IntArray, FloatArray], FloatArray]
+) -> int | None:  # fmt: skip
+    """Return the slot of most value among the nearest frontiers, or None if there is none.
+
+    Args:
+        belief: Belief of the robot.
+        held: Slot of the previous goal, the path to which counts half.
+        values: Function from the belief, slots (n,) and lengths (n,) [m] of the paths to them to their values (n,).
+    """
+    slots = nearest_own_frontiers(belief, MOST_PREDICTED)
+    lengths = np.where(slots == held, SWITCH_RATIO, 1.0) * belief.candidates.lengths[slots]
+    return int(slots[np.argmax(values(belief, slots, lengths))]) if len(slots) else None
 
 
 def predict_covariances(belief: Belief, slots: IntArray) -> list[FloatArray]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.batched.fidelity import COLUMNS, STUDY, Config, play, run, shortfalls, trials
+from studies.batched.fidelity import COLUMNS, STUDY, Config, play, run_again, shortfalls, trials
 from studies.filters import losses
 
 SMALL = Config(
@@ -17,13 +17,12 @@ SMALL = Config(
 def test_actions_played_again_give_the_same_episode() -> None:
     """With the environment's own estimator poses, rewards and merges repeat to the bit."""
     (episode,) = losses.trials(SMALL)
-    environment = losses.environment(SMALL, episode)
-    whole = run(environment, 70, "frontier")
-    again = run(environment, 70, "frontier", whole.actions)
-    assert len(whole.actions) == len(whole.episode.record.times) - 1
-    np.testing.assert_array_equal(again.episode.record.estimated, whole.episode.record.estimated)
-    np.testing.assert_array_equal(again.episode.record.map_errors, whole.episode.record.map_errors)
-    assert again.episode.record.merges == whole.episode.record.merges
+    whole = losses.recorded(SMALL, episode)
+    again = run_again(losses.environment(SMALL, episode), 70, "frontier", whole.actions)
+    assert len(whole.actions) == len(whole.record.times) - 1
+    np.testing.assert_array_equal(again.record.estimated, whole.record.estimated)
+    np.testing.assert_array_equal(again.record.map_errors, whole.record.map_errors)
+    assert again.record.merges == whole.record.merges
 
 
 def test_a_trial_compares_with_the_environment() -> None:

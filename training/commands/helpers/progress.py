@@ -18,6 +18,20 @@ if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that
 REDRAW_S = 0.1  # interval between redraws of the bar over trials
 
 
+def training_bar(console: Console, done: str = "{task.completed:,.0f} of {task.total:,.0f}") -> Progress:
+    """Return the bar of a training, with the field `status` and the time left.
+
+    Args:
+        console: Console of the command.
+        done: Template of the text before the bar.
+    """
+    columns = (
+        text_column(done), BarColumn(None), text_column("{task.fields[status]}"), TimeElapsedColumn(),
+        text_column("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    return Progress(*columns, console=console, expand=True, speed_estimate_period=300.0)
+
+
 @contextmanager
 def trial_progress(
     console: Console, total: int | None, completed: int = 0, timed: bool = True
