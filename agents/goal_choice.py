@@ -37,6 +37,17 @@ class Planner(Protocol):
         """Return the slot of the candidate to go to, or None to stay."""
 
 
+class Holder:
+    """Planner that remembers the slot that it chose last."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Clear the state of the last episode."""
+        self._held: int | None = None
+
+
 class GoalPolicy:
     """Policy for `goal` actions that goes where a planner chooses, and stays where it chooses nothing.
 

@@ -5,7 +5,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from agents.planners.targets import Targets, own_targets, team_targets
+from agents.goal_choice import Holder
+from agents.planners.common.targets import Targets, own_targets, team_targets
 from agents.policy import Policy
 from slam_backend.core.validation import IntArray
 from vslam_env.belief.team_belief import Belief
@@ -35,7 +36,7 @@ class TeamPolicy(Protocol):
         """
 
 
-class Assigned:
+class Assigned(Holder):
     """Planner of one robot that solves the assignment for its group on its own belief, and takes its own part.
 
     Args:
@@ -43,12 +44,8 @@ class Assigned:
     """
 
     def __init__(self, assign: Assign) -> None:
+        super().__init__()
         self._assign = assign
-        self.reset()
-
-    def reset(self) -> None:
-        """Clear the state of the last episode."""
-        self._held: int | None = None
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the previous one is kept unless another is much better."""

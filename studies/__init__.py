@@ -1,1 +1,1 @@
-"""Studies of this project's own parts, which are not installed: `python -m studies.alignment --help` and so on."""
+"""Studies of this project's own parts, which are not installed: `python -m studies.merging.alignment --help`."""

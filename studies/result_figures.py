@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slam_backend.core.validation import argument_error
-from training.experiments.plotting import picture, save_png
+from training.experiments.output.plotting import picture, save_png
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "reference" / "results.md"

@@ -12,9 +12,9 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from training.experiments.console import make_console, print_error
-from training.experiments.interrupt import signals_answered
-from training.experiments.logs import LogLevel, begin_logging
+from training.experiments.machine.interrupt import signals_answered
+from training.experiments.output.console import make_console, print_error
+from training.experiments.output.logs import LogLevel, begin_logging
 
 BAD_INPUT = 2
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

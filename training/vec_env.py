@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_int
-from training.experiments.compilation import prepare
+from training.experiments.output.compilation import prepare
 from training.rl.envs import MASK, WHOLE, MakeEnv, StepResult, SyncEnvs, WorkerEnvs
 from vslam_env import vslam_v1, warm_up
 from vslam_env.config import EnvConfig

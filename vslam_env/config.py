@@ -14,7 +14,7 @@ import tomli_w
 
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.text_files import parse_toml, read_toml
-from slam_backend.core.validation import argument_error, check_choice, check_float, check_int, did_you_mean
+from slam_backend.core.validation import argument_error, check_choice, check_float, check_int, check_kind, did_you_mean
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.options import MergeOptions
 from vslam_env.belief.belief import BeliefConfig
@@ -281,10 +281,7 @@ class EnvConfig:
         check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
         check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", at_least=1e-6, at_most=1e6)
         for name, kind in NESTED_CONFIGS.items():
-            if not isinstance(getattr(self, name), kind):
-                raise argument_error(
-                    name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...)."
-                )
+            check_kind(name, getattr(self, name), kind)
         if self.observe_images and (self.sensor, self.observation_type) != ("stereo", "dict"):
             hint = 'Use sensor="stereo" and observation_type="dict".'
             raise argument_error("observe_images", "False unless images are rendered and named", True, hint)

@@ -7,7 +7,7 @@ the other frontiers with the weight `REMOTENESS`.
 
 import numpy as np
 
-from agents.planners.targets import Targets
+from agents.planners.common.targets import Targets
 from slam_backend.core.validation import FloatArray, IntArray
 
 REMOTENESS = 0.5  # weight of the mean path length to the other frontiers

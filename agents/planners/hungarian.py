@@ -8,7 +8,7 @@ less, so that it finishes it. Deviation: rooms come from distances to walls (`ro
 
 import numpy as np
 
-from agents.planners.targets import Targets
+from agents.planners.common.targets import Targets
 from slam_backend.core.validation import FloatArray, IntArray
 
 SAME_ROOM = 0.5  # factor of the cost of the room in which a robot is

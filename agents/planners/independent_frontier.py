@@ -6,20 +6,13 @@ with `NearestFrontier` it shows what coordination is worth.
 
 import numpy as np
 
-from agents.goal_choice import nearest_slot
+from agents.goal_choice import Holder, nearest_slot
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
 
 
-class IndependentFrontier:
+class IndependentFrontier(Holder):
     """Planner that chooses the nearest frontier, and none where all is explored."""
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Clear the state of the last episode."""
-        self._held: int | None = None
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the previous one is kept unless another frontier is much nearer."""

@@ -7,7 +7,7 @@ instead of K-means clusters, frontiers move between the tours until the longest 
 
 import numpy as np
 
-from agents.planners.targets import Targets
+from agents.planners.common.targets import Targets
 from slam_backend.core.validation import IntArray
 from vslam_env.navigation import open_tour, share_places
 

@@ -6,7 +6,7 @@ Yamauchi, "Frontier-based exploration using multiple robots", Agents 1998, with 
 
 import numpy as np
 
-from agents.goal_choice import nearest_slot, own_share
+from agents.goal_choice import Holder, nearest_slot, own_share
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
 
@@ -24,15 +24,8 @@ def choose_slot(belief: Belief, held: int | None = None) -> int | None:
     return nearest_slot(candidates, own_share(belief, candidates.of_kind(CandidateKind.FRONTIER)), held)
 
 
-class NearestFrontier:
+class NearestFrontier(Holder):
     """Planner that chooses the nearest frontier to which no teammate is nearer, and none where all is explored."""
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Clear the state of the last episode."""
-        self._held: int | None = None
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the previous one is kept unless another frontier is much nearer."""

@@ -20,8 +20,9 @@ walls beside the path have their looks without a stop.
 
 import numpy as np
 
+from agents.goal_choice import Holder
+from agents.planners.common.targets import own_targets
 from agents.planners.distance_advantage import advantage_costs
-from agents.planners.targets import own_targets
 from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
@@ -33,15 +34,8 @@ PATH_SPREAD = 2.0  # [m] by which one frontier must cost more than another to be
 VIEW_SHARPNESS = 4.0  # power of the rates of views that gives preferences
 
 
-class NextBestView:
+class NextBestView(Holder):
     """Planner that explores, looks again and meets, in this order, within the time that is left."""
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Clear the state of the last episode."""
-        self._held: int | None = None
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to, or None if there is nothing left to see."""

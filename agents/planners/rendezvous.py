@@ -8,7 +8,7 @@ since maps are compared without contact of robots, and between visits the robot 
 
 import numpy as np
 
-from agents.goal_choice import nearest_slot, own_share
+from agents.goal_choice import Holder, nearest_slot, own_share
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
 
@@ -17,15 +17,12 @@ DETOUR = 15.0  # [m] longest path to a rendezvous while there are frontiers
 VISITED = 1.0  # [m]
 
 
-class Rendezvous:
+class Rendezvous(Holder):
     """Planner that alternates between the nearest frontier and visits of the nearest rendezvous."""
-
-    def __init__(self) -> None:
-        self.reset()
 
     def reset(self) -> None:
         """Clear the state of the last episode."""
-        self._held: int | None = None
+        super().reset()
         self._last = 0
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:

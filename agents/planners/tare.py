@@ -9,7 +9,7 @@ has a shorter path.
 
 import numpy as np
 
-from agents.planners.targets import Targets
+from agents.planners.common.targets import Targets
 from slam_backend.core.validation import BoolArray, IntArray
 from vslam_env.navigation import frontier_cells, open_tour, sees, tour_length
 

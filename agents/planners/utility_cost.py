@@ -8,7 +8,7 @@ decreases linearly with the distance.
 
 import numpy as np
 
-from agents.planners.targets import SIGHT, Targets
+from agents.planners.common.targets import SIGHT, Targets
 from slam_backend.core.validation import IntArray
 
 COST = 0.1  # [1/m] utility that a metre of path costs

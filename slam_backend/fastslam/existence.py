@@ -13,7 +13,7 @@ landmarks and particles are in `fastslam/_kernels/update/existence.py`.
 """
 
 from dataclasses import dataclass
-from math import exp, floor, log
+from math import log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,22 +101,6 @@ class ExistenceModel:
             # Below the rate of false alarms a detection would count against the landmark.
             seen = max(seen * self.frame_limit / expected, self.false_alarm)
         return log(seen / self.false_alarm), log((1.0 - seen) / (1.0 - self.false_alarm))
-
-    def misses_to_delete(self, log_odds: float) -> int:
-        """Return the least number of consecutive misses that deletes a landmark with these log-odds."""
-        return max(0, floor((log_odds - self.log_odds_floor) / -self.increments()[1]) + 1)
-
-    def deletion_bound(self, looks: int) -> float:
-        """Return a bound on the probability that a true landmark, expected in view `looks` times, is ever deleted.
-
-        For a landmark that exists and is detected with probability `detection`, E exp(-l) of its log-odds l is
-        constant. By Ville's inequality they ever fall by h with probability at most exp(-h). A landmark starts at its
-        prior, and again whenever it leaves the cap, at most `looks` times:
-
-            exp(floor - prior) + looks exp(floor - cap).
-        """
-        from_prior = exp(self.log_odds_floor - self.log_odds_prior)
-        return min(1.0, from_prior + looks * exp(self.log_odds_floor - self.log_odds_cap))
 
     def view(self, camera: StereoCamera) -> "FieldOfView":
         """Return the part of a camera's field of view in which landmarks are expected.

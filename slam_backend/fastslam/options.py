@@ -14,6 +14,7 @@ from slam_backend.core.validation import (
     check_choice,
     check_float,
     check_int,
+    check_kind,
     known_names,
 )
 from slam_backend.fastslam.existence import ExistenceModel
@@ -95,10 +96,7 @@ class FilterOptions:
         hint = "Use at least one particle; 100 is a good start."
         check_int("num_particles", self.num_particles, 1, hint, MAX_PARTICLES)
         for name, kind in (("camera", StereoCamera), ("motion", OdometryModel)):
-            if not isinstance(getattr(self, name), kind):
-                raise argument_error(
-                    name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...)."
-                )
+            check_kind(name, getattr(self, name), kind)
         check_choice("proposal", self.proposal, PROPOSALS)
         check_choice("resampling", self.resampling, tuple(RESAMPLING))
         check_float("resample_threshold", self.resample_threshold, "Give a share of M.", at_least=0.0, at_most=1.0)

@@ -173,11 +173,6 @@ class InputBuffer:
         """Return the number of buffered steps."""
         return len(self._steps)
 
-    @property
-    def buffered(self) -> Mapping[int, StepInput]:
-        """Inputs of the buffered steps, by number; read-only."""
-        return self._steps
-
     def record(self, step: int, inputs: StepInput) -> None:
         """Add the inputs of a step, later than all before; the caller does not write to them afterwards."""
         self._steps[step] = with_read_only(inputs)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_choice
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_choice, check_kind
 from slam_backend.maps import initial_estimates as proposals
 from slam_backend.maps.alignment_types import (
     DISTINCT_ROTATION,
@@ -186,11 +186,8 @@ def _checked(
     hint = "ransac replaces it: it is right wherever that was." if method in REMOVED else "Choose one of these names."
     check_choice("method", method, METHODS, hint)
     options = AlignmentOptions() if options is None else options
-    for name, value, kind in (
-        ("map_a", map_a, LandmarkMap), ("map_b", map_b, LandmarkMap), ("options", options, AlignmentOptions)
-    ):  # fmt: skip
-        if not isinstance(value, kind):
-            raise argument_error(name, f"a {kind.__name__}", value, f"Build one: {kind.__name__}(...).")
+    check_kind("map_a", map_a, LandmarkMap), check_kind("map_b", map_b, LandmarkMap)
+    check_kind("options", options, AlignmentOptions)
     rng = np.random.default_rng(0) if rng is None else rng
     if not isinstance(rng, np.random.Generator):
         raise argument_error("rng", "a numpy.random.Generator or None", rng, "Give np.random.default_rng(seed).")

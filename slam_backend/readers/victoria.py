@@ -15,9 +15,9 @@ from scipy.io import loadmat
 from slam_backend.core.files import checked_path
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_float
-from slam_backend.geometry import between
 from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import HOLD, integrate_commands, points_from_polar
+from slam_backend.readers.range_bearing import motions
 from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 
 CONTROLS_FILE = "aa3_dr.mat"
@@ -225,10 +225,8 @@ def to_filter_steps(log: VictoriaLog, noise: TreeNoise | None = None) -> Victori
     """
     noise = TreeNoise() if noise is None else noise
     path = integrate_commands(axle_velocities(log.controls), log.scan_times)
-    odometry = np.concatenate([np.zeros((1, 3)), between(path[:-1], path[1:])])
-    for array in (odometry, path):
-        array.setflags(write=False)
-    return VictoriaSteps(log.scan_times, odometry, tuple(_frame(trees, noise) for trees in log.scans))
+    path.setflags(write=False)
+    return VictoriaSteps(log.scan_times, motions(path), tuple(_frame(trees, noise) for trees in log.scans))
 
 
 def axle_velocities(controls: FloatArray) -> FloatArray:

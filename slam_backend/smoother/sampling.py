@@ -77,7 +77,6 @@ class PathSamples(NamedTuple):
         weights: (M,) float64. Normalised importance weights; NaN if one is not finite.
         sample_size: Effective sample size of the weights; NaN if one is not finite.
         transition_variances: (k,) float64 [m^2]. Variances of the motions from the previous keys, headings at `LEVER`.
-        is_retracted: Whether the paths were retracted on SE(2).
     """
 
     poses: FloatArray
@@ -85,7 +84,6 @@ class PathSamples(NamedTuple):
     weights: FloatArray
     sample_size: float
     transition_variances: FloatArray
-    is_retracted: bool = False
 
     @classmethod
     def weighed(cls, poses: FloatArray, log_weights: FloatArray, transition_variances: FloatArray) -> Self:
@@ -156,7 +154,6 @@ def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: n
     if gaussian.sample_size >= MIN_GAUSSIAN_SAMPLE_SIZE * num_particles:
         return gaussian
     retracted = importance_weights(graph, mode, _retracted(graph, mode, poses), log_proposals)
-    retracted = retracted._replace(is_retracted=True)
     return max(gaussian, retracted, key=lambda draws: np.nan_to_num(draws.sample_size))
 
 

@@ -23,7 +23,7 @@ from slam_backend.team.reports import (
 from slam_backend.team.team import TeamSlam
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam
-from training.episodes.runner import EpisodeRecord, run_episode
+from training.episodes.runner import EpisodeRecord, Progress, run_episode
 from vslam_env.belief.readings import Readings
 from vslam_env.belief.team_belief import merge_options
 from vslam_env.config import EnvConfig
@@ -44,6 +44,7 @@ class RecordedEpisode:
     landmarks: FloatArray  # (N, 3) float64 [m], world frame. All landmarks of the world.
     observable: IntArray  # (N',) int64. Indices of the landmarks that the record's claims refer to.
     record: EpisodeRecord  # Record of the episode
+    actions: tuple[Mapping[str, Any], ...]  # Actions of the robots by step
 
     @property
     def odometry(self) -> FloatArray:
@@ -79,18 +80,21 @@ def record_episode(env: ExplorationEnv, policies: Mapping[str, Policy] | Guarded
     """Run an episode to its end and record its readings with the true landmarks of all measurements."""
     readings: list[tuple[Readings, ...]] = []
     true_ids: list[tuple[IntArray, ...]] = []
+    actions: list[Mapping[str, Any]] = []
 
     def note(tick: tuple[Readings, ...]) -> None:
         readings.append(tick)
         if len(readings) > 1:  # the frames of the reset are taken before the environment has its episode
             true_ids.append(tuple(frame.true_ids for frame in env.episode.frames))
 
-    def note_reset(progress: Any) -> None:
+    def note_step(progress: Progress) -> None:
         if progress.step == 0:
             true_ids.append(tuple(frame.true_ids for frame in env.episode.frames))
+        else:
+            actions.append(progress.actions)
 
     env.recorder = note
-    record = run_episode(env, policies, seed, note_reset)
+    record = run_episode(env, policies, seed, note_step)
     env.recorder = None
     episode = env.episode
     landmarks = episode.world.landmarks
@@ -99,6 +103,7 @@ def record_episode(env: ExplorationEnv, policies: Mapping[str, Policy] | Guarded
         config=env.config, belief_seed=episode.belief_seed, readings=tuple(readings), true_ids=tuple(true_ids),
         true_paths=episode.true_path.swapaxes(0, 1).copy(), landmarks=landmarks.positions.copy(),
         observable=np.flatnonzero(episode.scenario.observable_landmarks), record=record,
+        actions=tuple(actions),
     )  # fmt: skip
 
 

@@ -1,1 +1,1 @@
-"""Learning: what the reward tells a learner, and another learning library."""
+"""Learning: what the reward tells a learner, another learning library, and the time of training."""

@@ -27,7 +27,7 @@ import numpy as np
 
 from slam_backend import Alignment, LandmarkMap, align_maps, fuse_maps
 from slam_backend.geometry import between
-from training.experiments.numerics import PORTABLE, numerics, variables_for
+from training.experiments.machine.numerics import PORTABLE, numerics, variables_for
 from vslam_env import vslam_v0
 
 FILE = Path(__file__).with_name("digests.json")
@@ -183,8 +183,8 @@ def pair_of_maps(rng: np.random.Generator, count: int) -> tuple[LandmarkMap, Lan
 def commands() -> dict[str, list[str]]:
     """Return the commands whose metrics are hashed."""
     found = {
-        "studies accuracy": ["studies.accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
-        "studies alignment": ["studies.alignment", "--seeds", "2", "--hard", "9"],
+        "studies accuracy": ["studies.filters.accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
+        "studies alignment": ["studies.merging.alignment", "--seeds", "2", "--hard", "9"],
         "run": ["training", "run", "--world", "maze", "--robots", "2", "--max-cycles", "120", "--no-video"],
     }
     logs = (

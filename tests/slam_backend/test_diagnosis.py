@@ -15,8 +15,8 @@ from slam_backend.models.measurements import Measurements
 from slam_backend.smoother.log_arrays import ODOMETRY, LogArrays
 from slam_backend.smoother.reassociation import LandmarkTable
 from slam_backend.team.team import TeamSlam
-from studies import circle_world
-from studies.circle_world import MOTION, CircleLog, Mistake, circle_log
+from studies.filters import circle_world
+from studies.filters.circle_world import MOTION, CircleLog, Mistake, circle_log
 
 
 @pytest.mark.parametrize("by_names", [True, False])

@@ -1,1 +1,1 @@
-"""Commands of `vslam`: options, progress displays and run folders; other packages do the work."""
+"""Commands of `vslam`: options, progress displays and run folders, with `helpers`; other packages do the work."""

@@ -7,8 +7,8 @@ import typer
 
 from training.bench.exploration.config import ExplorationConfig
 from training.bench.speed.config import BatchedSpeedConfig, EnvSpeedConfig, FilterSpeedConfig, StartSpeedConfig
-from training.commands._options import Cluster, Workers, options
-from training.commands._plan import (
+from training.commands.helpers.options import Cluster, Workers, options
+from training.commands.helpers.plan import (
     Base,
     PlanName,
     Tracks,
@@ -20,7 +20,7 @@ from training.commands._plan import (
     write_leaderboard,
     write_submission,
 )
-from training.commands._run_folder import Call
+from training.commands.helpers.run_folder import Call
 from training.commands.study import run_study
 
 bench = typer.Typer(help="Compare policies, and measure the speed of filters and environments.", no_args_is_help=True)
@@ -151,8 +151,9 @@ def _say_where(name: str, hint: str) -> None:
 
 
 MOVED = {
-    "accuracy": "accuracy or studies.losses", "alignment": "alignment", "mrclam": "mrclam_pairs", "scale": "scale",
-    "stereo": "stereo", "train": "training_speed",
+    "accuracy": "filters.accuracy or studies.filters.losses", "alignment": "merging.alignment",
+    "mrclam": "merging.mrclam_pairs", "scale": "environment.scale", "stereo": "front_end.stereo",
+    "train": "learning.speed",
 }  # fmt: skip
 for _name, _study in MOVED.items():
     _say_where(_name, f"In a clone: python -m studies.{_study}.")

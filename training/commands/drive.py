@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from training.experiments.compilation import prepare
-from training.experiments.console import make_console
+from training.experiments.output.compilation import prepare
+from training.experiments.output.console import make_console
 
 EPISODE_S = 600.0  # [s]
 
@@ -40,8 +40,8 @@ def drive_by_hand(
     from slam_backend.core.validation import argument_error
     from training.episodes.teleoperation import KEYS, drive
     from training.episodes.video import VideoWriter
-    from training.experiments.interrupt import interrupt_flag
-    from training.experiments.tables import E_SCALE
+    from training.experiments.machine.interrupt import interrupt_flag
+    from training.experiments.output.tables import E_SCALE
     from vslam_env import vslam_v1
     from vslam_env.rendering.window import Window, display_unavailable_reason
 

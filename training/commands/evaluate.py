@@ -1,7 +1,7 @@
 """Command `vslam evaluate`: comparison of a trained model with baseline policies on unseen worlds."""
 
-from training.commands._options import Workers, options
-from training.commands._run_folder import Call
+from training.commands.helpers.options import Workers, options
+from training.commands.helpers.run_folder import Call
 from training.commands.study import run_study
 from training.rl.config import EvaluateConfig
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.commands._options import Json
-from training.commands._run_folder import write_json
-from training.experiments.console import make_console
+from training.commands.helpers.options import Json
+from training.commands.helpers.run_folder import write_json
+from training.experiments.output.console import make_console
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.maps.alignment_types import Alignment
@@ -35,7 +35,7 @@ def merge(
     from slam_backend.maps.alignment import AlignmentOptions, align_maps
     from slam_backend.maps.fusion import fuse_maps
     from slam_backend.maps.landmark_map import LandmarkMap, check_suffix
-    from training.experiments.map_figure import draw_maps
+    from training.experiments.output.map_figure import draw_maps
     from training.experiments.run_folder import plain, to_json
 
     check_suffix(out, "out")

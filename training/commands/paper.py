@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from training.commands._options import Check, Workers, options
-from training.commands._run_folder import Call
+from training.commands.helpers.options import Check, Workers, options
+from training.commands.helpers.run_folder import Call
 from training.commands.study import run_study, write_tables
 from training.paper.config import Fig1Config, Fig2Config, Fig5Config, Fig6Config, PairConfig
 

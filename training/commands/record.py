@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from training.commands._options import Workers, options
-from training.commands._progress import TrialSet, run_trial_set, trial_progress
-from training.commands._run_folder import Call
+from training.commands.helpers.options import Workers, options
+from training.commands.helpers.progress import TrialSet, run_trial_set, trial_progress
+from training.commands.helpers.run_folder import Call
 from training.dataset.config import RecordConfig
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
@@ -104,8 +104,8 @@ def verify_dataset(call: Call[RecordConfig], folder: Path, workers: int) -> None
     from slam_backend.core.validation import argument_error
     from training.dataset.reading import check_file, read_description
     from training.dataset.recording import play
-    from training.experiments.compilation import prepare
-    from training.experiments.console import print_error
+    from training.experiments.output.compilation import prepare
+    from training.experiments.output.console import print_error
     from training.experiments.policy_names import check_configuration
     from training.experiments.run_folder import installed_versions, read_config, read_versions
     from training.experiments.trial_store import FAILED, run_in_processes

@@ -9,12 +9,12 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from training.commands._options import options
-from training.commands._progress import share_progress
-from training.commands._run_folder import Call
+from training.commands.helpers.options import options
+from training.commands.helpers.progress import share_progress
+from training.commands.helpers.run_folder import Call
 from training.commands.study import write_tables
 from training.episodes.tables import print_consistency, print_tables, write_maps
-from training.experiments.console import print_warning
+from training.experiments.output.console import print_warning
 from training.replay.config import (
     KITTI,
     MRCLAM,

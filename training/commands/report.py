@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from training.commands._run_folder import claim_stdout, write_json
-from training.experiments.console import make_console
+from training.commands.helpers.run_folder import claim_stdout, write_json
+from training.experiments.output.console import make_console
 
 Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser.")]
 

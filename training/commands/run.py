@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.progress import BarColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from training.commands._options import options
-from training.commands._run_folder import Call
+from training.commands.helpers.options import options
+from training.commands.helpers.run_folder import Call
 from training.episodes.config import RunConfig
-from training.experiments.console import text_column
+from training.experiments.output.console import text_column
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.episodes.runner import EpisodeRecord, MergeRecord, Progress
@@ -56,7 +56,7 @@ def run(
     from training.episodes.figures import draw_errors, draw_maps
     from training.episodes.metrics import score_episode
     from training.episodes.tables import print_consistency, print_tables, write_maps
-    from training.experiments.interrupt import interrupt_flag
+    from training.experiments.machine.interrupt import interrupt_flag
     from training.experiments.run_folder import plain
     from training.report.content import live_content
     from training.report.live import LiveView

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.commands._options import Json, words
-from training.commands._run_folder import write_json
-from training.experiments.console import make_console
+from training.commands.helpers.options import Json, words
+from training.commands.helpers.run_folder import write_json
+from training.experiments.output.console import make_console
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.core.validation import FloatArray
@@ -99,7 +99,7 @@ def print_score(found: "TeamScore", names: list[str]) -> None:
     """Print the errors of the robots, of the team, and of the map."""
     import numpy as np
 
-    from training.experiments.tables import console_table, number
+    from training.experiments.output.tables import console_table, number
 
     console = make_console()
     rows = [

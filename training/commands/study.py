@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.console import Console
 
-from training.commands._options import Cluster, Workers, options
-from training.commands._progress import TrialSet, run_trial_set
-from training.commands._run_folder import Call
+from training.commands.helpers.options import Cluster, Workers, options
+from training.commands.helpers.progress import TrialSet, run_trial_set
+from training.commands.helpers.run_folder import Call
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.experiments.study import Claim, ResultTable, Row, Study
@@ -60,9 +60,9 @@ def run_study(
     Raises:
         typer.Exit: With status 2 if trials failed, or 1 if `check` is set and a claim does not hold.
     """
-    from training.experiments.study_chart import draw_chart, draw_curves
-    from training.experiments.tables import csv_of
-    from training.experiments.timing import busy_note, describe_machine
+    from training.experiments.machine.timing import busy_note, describe_machine
+    from training.experiments.output.study_chart import draw_chart, draw_curves
+    from training.experiments.output.tables import csv_of
 
     machine = {"machine": describe_machine()} if study.timed else {}
     console, folder = call.begin(*study.checks(call.config))
@@ -89,9 +89,9 @@ def write_tables(
     **metrics: Any,
 ) -> None:  # fmt: skip
     """Print the tables of some rows and the claims about them, and write both with the rows into the run folder."""
+    from training.experiments.output.tables import console_table, csv_of
     from training.experiments.run_folder import plain
     from training.experiments.study import Column
-    from training.experiments.tables import console_table, csv_of
 
     found = [(table, lines) for table in tables if (lines := table.lines(rows))]
     for table, lines in found:
@@ -114,7 +114,7 @@ def print_table(console: Console, table: "ResultTable", lines: Sequence[dict[str
     Units and intervals are on a second line. Where there is no room, headings are folded first, then texts, and
     numbers last.
     """
-    from training.experiments.tables import console_table
+    from training.experiments.output.tables import console_table
 
     for title, rows in table.parts(lines):
         cells = [[re.sub(r" \((\S+) \.\. (\S+)\)$", r"\n\1..\2", text) for text in row] for row in rows]

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from training.commands._options import options
-from training.commands._run_folder import Call
-from training.experiments.compilation import prepare
-from training.experiments.console import text_column
+from training.commands.helpers.options import options
+from training.commands.helpers.progress import training_bar
+from training.commands.helpers.run_folder import Call
+from training.experiments.output.compilation import prepare
 from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
@@ -56,7 +56,7 @@ def train(
     weights as an uninterrupted training, even if the process was killed.
     """
     from slam_backend.core.validation import argument_error, check_int
-    from training.experiments.cluster import LostWorkerError, connected
+    from training.experiments.machine.cluster import LostWorkerError, connected
     from training.experiments.run_folder import RunFolder, installed_versions
 
     require_extra()
@@ -121,14 +121,8 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
     import time
     from contextlib import ExitStack
 
-    from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+    from training.experiments.machine.interrupt import interrupt_flag
 
-    from training.experiments.interrupt import interrupt_flag
-
-    columns = (
-        text_column("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None),
-        text_column("{task.fields[status]}"), TimeElapsedColumn(), text_column("left"), TimeRemainingColumn(),
-    )  # fmt: skip
     config, begin = training.config, time.perf_counter()
     total, done = config.updates * config.rollout, len(training.rows) * config.rollout
     if done >= total:
@@ -138,7 +132,7 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
         rollouts = f"{len(training.rows)} of {config.updates} rollouts are finished"
         console.print(f"Resuming: {rollouts}, {config.updates - len(training.rows)} are left.")
     with ExitStack() as stack:
-        bar = stack.enter_context(Progress(*columns, console=console, expand=True, speed_estimate_period=300.0))
+        bar = stack.enter_context(training_bar(console))
         status = _rollout_text(training.rows[-1]) if done else "first rollout"
         task = bar.add_task("", total=total, completed=done, status=status)
         on_press = partial(bar.update, task, status="stopping after this rollout")
@@ -163,14 +157,8 @@ def _imitate_live(console: Console, imitation: "Imitation") -> tuple[bool, float
     """
     import time
 
-    from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+    from training.experiments.machine.interrupt import interrupt_flag
 
-    from training.experiments.interrupt import interrupt_flag
-
-    columns = (
-        text_column("{task.description}"), BarColumn(None), text_column("{task.fields[status]}"), TimeElapsedColumn(),
-        text_column("left"), TimeRemainingColumn(),
-    )  # fmt: skip
     begin = time.perf_counter()
     epochs, config = imitation.config.epochs * (imitation.config.rounds or 0), imitation.config
     if len(imitation.rows) >= epochs:
@@ -178,8 +166,7 @@ def _imitate_live(console: Console, imitation: "Imitation") -> tuple[bool, float
         return True, 0.0
     if imitation.rows:
         console.print(f"Resuming: {len(imitation.rows)} of {epochs} epochs are finished.")
-    bar = Progress(*columns, console=console, expand=True, speed_estimate_period=300.0)
-    with bar, interrupt_flag() as interrupted:
+    with training_bar(console, "{task.description}") as bar, interrupt_flag() as interrupted:
         task = None
 
         def on_progress(stage: str, done: float, total: float) -> None:
@@ -203,7 +190,7 @@ def _epoch_text(rows: "Sequence[Row]") -> str:
 
 def _finish_imitation(call: Call[TrainConfig], imitation: "Imitation", complete: bool, seconds: float) -> None:
     """Write and print the results of the imitation."""
-    from training.experiments.tables import csv_of
+    from training.experiments.output.tables import csv_of
     from training.rl.curves import draw_imitation
 
     rows, console, folder = imitation.rows, call.console, call.folder
@@ -233,7 +220,7 @@ def _rollout_text(row: "Row") -> str:
 
 def _finish(call: Call[TrainConfig], training: "Training", complete: bool, seconds: float) -> None:
     """Write and print the results of the training."""
-    from training.experiments.tables import E_SCALE, csv_of
+    from training.experiments.output.tables import E_SCALE, csv_of
     from training.rl.curves import draw_learning, first_and_last_tenth
 
     rows, console, folder = training.rows, call.console, call.folder

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from training.commands._options import options
-from training.commands._run_folder import Call
-from training.experiments.console import text_column
+from training.commands.helpers.options import options
+from training.commands.helpers.progress import training_bar
+from training.commands.helpers.run_folder import Call
 from training.rl.batched_config import BatchedTrainConfig
 from training.rl.config import require_extra
 
@@ -37,7 +37,7 @@ def train_batched(
     Ctrl-C stops after the current rollout and saves. --resume FOLDER continues from the last checkpoint with new
     episodes.
     """
-    from training.experiments.compilation import prepare
+    from training.experiments.output.compilation import prepare
     from training.experiments.run_folder import RunFolder, installed_versions
 
     made: list[BatchedExploration] = []
@@ -71,17 +71,10 @@ def _run_live(call: Call[BatchedTrainConfig], training: "BatchedTraining") -> bo
     Returns:
         Whether the training is complete.
     """
-    from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+    from training.experiments.machine.interrupt import interrupt_flag
 
-    from training.experiments.interrupt import interrupt_flag
-
-    columns = (
-        text_column("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None),
-        text_column("{task.fields[status]}"), TimeElapsedColumn(), text_column("left"), TimeRemainingColumn(),
-    )  # fmt: skip
     config, begin = training.config, time.perf_counter()
-    bar = Progress(*columns, console=call.console, expand=True, speed_estimate_period=300.0)
-    with bar, interrupt_flag() as interrupted:
+    with training_bar(call.console) as bar, interrupt_flag() as interrupted:
         task = bar.add_task("", total=config.updates, completed=len(training.rows), status="compiling")
 
         def is_over() -> bool:
@@ -101,7 +94,7 @@ def _run_live(call: Call[BatchedTrainConfig], training: "BatchedTraining") -> bo
 
 def _finish(call: Call[BatchedTrainConfig], training: "BatchedTraining", complete: bool, seconds: float) -> None:
     """Write and print the results of the training."""
-    from training.experiments.tables import csv_of
+    from training.experiments.output.tables import csv_of
     from training.rl.curves import draw_learning, first_and_last_tenth
 
     rows, folder = [row for row in training.rows if row["episodes"]], call.folder

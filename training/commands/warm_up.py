@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from training.experiments.console import make_console
+from training.experiments.output.console import make_console
 
 
 def warm_up(
@@ -17,7 +17,7 @@ def warm_up(
     """Compile the kernels into the disk cache; takes seconds if they are cached already."""
     import vslam_env
     from slam_backend.core.jit import IS_PLAIN
-    from training.experiments.compilation import compilation_progress
+    from training.experiments.output.compilation import compilation_progress
 
     costs: dict[str, float] = {}
     with compilation_progress(make_console(stderr=True)) as progress:

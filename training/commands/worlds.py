@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from training.experiments.console import make_console
+from training.experiments.output.console import make_console
 
 worlds = typer.Typer(help="List, preview, check and import worlds.", no_args_is_help=True)
 
@@ -63,7 +63,7 @@ def preview(
     from slam_backend.core.files import check_writable, write_file
     from slam_backend.core.validation import argument_error
     from training.episodes.world_survey import contact_sheet
-    from training.experiments.compilation import compilation_progress
+    from training.experiments.output.compilation import compilation_progress
 
     if out.suffix.lower() != ".png":
         raise argument_error("out", "a name that ends in .png", out, "Pictures are written as PNG.")

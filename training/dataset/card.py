@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from training.dataset.recording import Field
+from training.experiments.output.tables import escaped, markdown_table, significant
 from training.experiments.run_folder import CONFIG_FILE, RunFolder
-from training.experiments.tables import escaped, markdown_table, significant
 
 CARD = "README.md"
 SUMS = "SHA256SUMS"

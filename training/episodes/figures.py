@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.geometry import compose, rotate_covariances, transform_points
 from training.episodes.runner import EpisodeRecord, MergeRecord
-from training.experiments.plotting import picture, rgb, save_png
-from training.experiments.tables import E_NOTHING
+from training.experiments.output.plotting import picture, rgb, save_png
+from training.experiments.output.tables import E_NOTHING
 from vslam_env.rendering import Scene
 from vslam_env.rendering.canvas import CHI_SQUARE_95
 from vslam_env.rendering.overlays import scale_length

@@ -16,7 +16,7 @@ from slam_backend.metrics import nees
 from slam_backend.team.reports import MergeEvent, PairAttempts, count_attempts
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam
-from training.experiments.logs import LOGGER
+from training.experiments.output.logs import LOGGER
 from vslam_env.belief.readings import Readings
 from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv

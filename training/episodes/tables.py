@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from training.experiments.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, console_table, heading, in_words, number
+from training.experiments.output.tables import (
+    ATE_NOTE,
+    E_SCALE,
+    MAPS_NOTE,
+    NIS_NOTE,
+    console_table,
+    heading,
+    in_words,
+    number,
+)
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.fastslam.consistency import Consistency

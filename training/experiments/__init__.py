@@ -1,1 +1,1 @@
-"""Common tools of all experiments: configuration, run folders, stored trials, statistics, tables, plots."""
+"""Common tools of all experiments: configuration, run folders, stored trials, studies and their statistics."""

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.stats import gmean
 
 from training.experiments.config import ExperimentConfig
+from training.experiments.output.tables import csv_text, heading, in_words, markdown_table, number
 from training.experiments.statistics import differences, grouped, interval
-from training.experiments.tables import csv_text, heading, in_words, markdown_table, number
 
 Row = Mapping[str, Any]
 ConfigT = TypeVar("ConfigT", bound=ExperimentConfig)
@@ -56,7 +56,7 @@ class Column:
 
     Attributes:
         name: Field of the rows, or name of the quantity if `statistic` is a function.
-        heading: Heading with its unit; empty: that of `training.experiments.tables.WORDS`, or the name in words.
+        heading: Heading with its unit; empty: that of `training.experiments.output.tables.WORDS`, or the name in words.
         statistic: A name in `STATISTICS`, over the values of the rows that have one; or a function of the rows, which
             returns a number, a text or an `Estimate`, None if there is none.
         digits: Digits after the point.

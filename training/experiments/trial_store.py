@@ -17,8 +17,8 @@ from filelock import FileLock, Timeout
 from slam_backend.core.files import append_text, write_file
 from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import argument_error
-from training.experiments.cluster import SINGLE_THREAD, over_cluster
-from training.experiments.interrupt import begin_worker, signals_held
+from training.experiments.machine.cluster import SINGLE_THREAD, over_cluster
+from training.experiments.machine.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
 LOCK_FILE = ".lock"  # in a run folder: held by the process that adds to it

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from slam_backend.core.validation import FloatArray, IntArray
-from training.experiments.plotting import picture, rgb, save_png
+from training.experiments.output.plotting import picture, rgb, save_png
 from training.experiments.study import Column, ResultTable
 from training.paper.config import Fig1Config
 from training.paper.fig6.trials import FILTER_OPTIONS, REGIMES

@@ -16,7 +16,7 @@ from slam_backend.maps.alignment import Alignment, align_maps, candidate_matches
 from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.fusion import fuse_maps, move_covariances
 from slam_backend.maps.landmark_map import LandmarkMap
-from training.experiments.plotting import CHI_SQUARE_95, ellipse_95, picture, save_png
+from training.experiments.output.plotting import CHI_SQUARE_95, ellipse_95, picture, save_png
 from training.experiments.study import Column, ResultTable
 from training.paper.config import PairConfig
 from training.paper.map_pairs import Stage, map_alone, simulate_pair, true_motion

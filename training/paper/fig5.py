@@ -14,7 +14,7 @@ from matplotlib.patches import Wedge
 
 from agents.registry import make_policy
 from slam_backend.core.validation import BoolArray, FloatArray
-from training.experiments.plotting import picture, save_png
+from training.experiments.output.plotting import picture, save_png
 from training.experiments.study import Column, ResultTable, Row
 from training.paper.config import Fig5Config
 from vslam_env import EnvConfig, vslam_v1

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.maps.landmark_map import LandmarkMap
-from training.experiments.plotting import ellipse_95, picture, save_png
+from training.experiments.output.plotting import ellipse_95, picture, save_png
 from training.replay.core import Replay
 from training.replay.log import Log
 from training.replay.metrics import PathScore, align_to_truth, paths_of

@@ -12,7 +12,7 @@ from slam_backend.frontend import StereoFrame
 from slam_backend.frontend.images import Image
 from slam_backend.frontend.odometry import CameraMotion
 from slam_backend.geometry import inverse, transform_points
-from training.experiments.plotting import picture
+from training.experiments.output.plotting import picture
 
 KNOWN, NEW, REFUSED, EXPECTED = (90, 200, 90), (60, 170, 250), (70, 70, 230), (230, 190, 90)  # blue, green, red
 

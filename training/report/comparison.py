@@ -9,9 +9,9 @@ import numpy as np
 from rich.console import Console
 
 from slam_backend.core.validation import argument_error
+from training.experiments.output.tables import console_table, heading, in_words, number
 from training.experiments.run_folder import plain
 from training.experiments.statistics import interval
-from training.experiments.tables import console_table, heading, in_words, number
 from training.report.content import (
     CURVES_FILE,
     Content,

@@ -14,9 +14,9 @@ import numpy as np
 
 from slam_backend.core.text_files import read_json, read_text, read_toml
 from slam_backend.core.validation import FloatArray, argument_error
+from training.experiments.output.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, heading, in_words, significant
 from training.experiments.policy_names import parted_label
 from training.experiments.run_folder import CONFIG_FILE, METRICS_FILE
-from training.experiments.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, heading, in_words, significant
 from training.report.packing import Packer
 from training.report.recording import RECORDING_FILE, Recording, axes_95
 from vslam_env.navigation import CELL, FREE, OCCUPIED, CandidateKind

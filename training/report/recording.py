@@ -20,7 +20,7 @@ from slam_backend.geometry import compose, rotate_covariances
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.reports import MergeEvent
 from training.episodes.runner import EpisodeRecord, MergeRecord, Progress, describe_event
-from training.experiments.plotting import CHI_SQUARE_95
+from training.experiments.output.plotting import CHI_SQUARE_95
 from training.experiments.run_folder import plain
 from vslam_env.belief.team_belief import Belief
 from vslam_env.config import TICK

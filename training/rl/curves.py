@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from slam_backend.core.validation import FloatArray
-from training.experiments.plotting import picture, save_png
+from training.experiments.output.plotting import picture, save_png
 
 Row = Mapping[str, float]
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, argument_error
-from training.experiments.cluster import ClusterPool, with_traceback
-from training.experiments.interrupt import begin_worker, signals_held
+from training.experiments.machine.cluster import ClusterPool, with_traceback
+from training.experiments.machine.interrupt import begin_worker, signals_held
 from training.experiments.trial_store import one_thread_each
 
 CLOSE_S = 5.0  # time after which running workers are killed

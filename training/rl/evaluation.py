@@ -9,9 +9,9 @@ from agents.registry import make_policy
 from agents.trained import trained_policy
 from training.bench.exploration.players import label
 from training.episodes.runner import run_episode
+from training.experiments.output.tables import E_SCALE
 from training.experiments.policy_names import parted_label
 from training.experiments.study import Column, ResultTable, Study, Words
-from training.experiments.tables import E_SCALE
 from training.rl.config import MODEL, EvaluateConfig, EvaluateTrial
 from vslam_env import vslam_v1
 from vslam_env.environment import ExplorationEnv

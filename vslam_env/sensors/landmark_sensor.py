@@ -13,10 +13,10 @@ from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
     IntArray,
-    argument_error,
     check_array,
     check_float,
     check_int,
+    check_kind,
 )
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
@@ -57,8 +57,7 @@ class LandmarkSensorConfig:
     max_incidence: float = float(np.radians(60.0))
 
     def __post_init__(self) -> None:
-        if not isinstance(self.camera, StereoCamera):
-            raise argument_error("sensor.camera", "a StereoCamera", self.camera, "Build one with StereoCamera(...).")
+        check_kind("sensor.camera", self.camera, StereoCamera)
         check_int("sensor.max_measurements", self.max_measurements, 1, "Report at least one point a frame.", MAX_POINTS)
         check_float(
             "sensor.detection_probability", self.detection_probability, "Give a share.", at_least=0.0, at_most=1.0

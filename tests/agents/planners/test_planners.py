@@ -9,9 +9,9 @@ import pytest
 from builders.environments import know
 
 from agents import make_policy, make_team_policy
+from agents.planners.common.targets import NO_PATH, Targets, own_targets, team_targets
 from agents.planners.hungarian import assign_all, hungarian
 from agents.planners.tare import LEFT_OVER, draw_cover
-from agents.planners.targets import NO_PATH, Targets, own_targets, team_targets
 from agents.planners.utility_cost import COST, utility_cost
 from agents.registry import ASSIGNMENTS, PLANNERS
 from slam_backend.geometry import compose, inverse

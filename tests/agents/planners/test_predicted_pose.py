@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.planners.predicted_pose import _information, _poses_along, d_optimality, predict_covariances
+from agents.planners.common.predicted_pose import _information, _poses_along, d_optimality, predict_covariances
 from slam_backend.core.validation import FloatArray
 from slam_backend.maps.landmark_map import LandmarkMap
 from tests.agents.test_policies import ROOM

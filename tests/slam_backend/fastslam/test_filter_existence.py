@@ -43,6 +43,22 @@ def probability(log_odds: float) -> float:
     return float(1.0 / (1.0 + np.exp(-log_odds)))
 
 
+def misses_to_delete(model: ExistenceModel, log_odds: float) -> int:
+    """Return the least number of consecutive misses that deletes a landmark with these log-odds."""
+    return max(0, int((log_odds - model.log_odds_floor) // -model.increments()[1]) + 1)
+
+
+def deletion_bound(model: ExistenceModel, looks: int) -> float:
+    """Return a bound on the probability that a true landmark, expected in view `looks` times, is ever deleted.
+
+    For a landmark that exists and is detected with probability `detection`, E exp(-l) of its log-odds l is constant. By
+    Ville's inequality they ever fall by h with probability at most exp(-h). A landmark starts at its prior, and again
+    whenever it leaves the cap, at most `looks` times.
+    """
+    from_prior = np.exp(model.log_odds_floor - model.log_odds_prior)
+    return float(min(1.0, from_prior + looks * np.exp(model.log_odds_floor - model.log_odds_cap)))
+
+
 @EVERY_MODEL
 @given(sightings=st.lists(st.booleans(), max_size=12))
 def test_log_odds_are_bayes_rule(model: ExistenceModel, sightings: list[bool]) -> None:
@@ -77,9 +93,9 @@ def test_a_false_landmark_is_deleted_after_the_stated_number_of_misses(model: Ex
         while log_odds >= model.log_odds_floor:
             log_odds = updated_log_odds(log_odds, False, True, sighting, miss, model.log_odds_cap)
             misses += 1
-        assert misses == model.misses_to_delete(start)
+        assert misses == misses_to_delete(model, start)
         assert probability(start + misses * miss) < model.delete_below <= probability(start + (misses - 1) * miss)
-    assert model.misses_to_delete(model.log_odds_floor - 1e-9) == 0
+    assert misses_to_delete(model, model.log_odds_floor - 1e-9) == 0
 
 
 def lives(model: ExistenceModel, seen_with: float, looks: int, runs: int, seed: int) -> tuple[int, int]:
@@ -100,7 +116,7 @@ def lives(model: ExistenceModel, seen_with: float, looks: int, runs: int, seed: 
 def test_a_true_landmark_survives_with_the_stated_probability(model: ExistenceModel, looks: int) -> None:
     """Seen with probability `detection`, no more than the stated share is ever deleted; false alarm 1e-3."""
     died, _ = lives(model, model.detection, looks, 20_000, seed=100)
-    assert 0 < died <= stats.binom.isf(1e-3, 20_000, model.deletion_bound(looks))
+    assert 0 < died <= stats.binom.isf(1e-3, 20_000, deletion_bound(model, looks))
 
 
 @EVERY_MODEL
@@ -232,7 +248,7 @@ def test_an_unconfirmed_landmark_is_deleted_after_the_stated_number_of_misses(
     """It is held through one miss less than the model says, and nothing remains of it after that miss."""
     slam = standing(model, proposal=proposal, resample_threshold=0.0)
     slam.step([None], [frame(0, 2)])
-    misses = model.misses_to_delete(model.log_odds_prior)
+    misses = misses_to_delete(model, model.log_odds_prior)
     for _ in range(misses - 1):
         slam.step([None], [frame(0)])
     np.testing.assert_array_equal(slam.map().ids, [0, 1])
@@ -317,7 +333,7 @@ def test_memory_of_deleted_landmarks_is_reused(proposal: Any) -> None:
         held.append(slam.num_landmarks)
         if step == 20:
             memory = slam.maps.nbytes
-    assert max(held) == ExistenceModel().misses_to_delete(0.0)
+    assert max(held) == misses_to_delete(ExistenceModel(), 0.0)
     assert slam.maps.nbytes == memory
     assert slam.maps.next_id == 200
 
@@ -339,7 +355,7 @@ def test_true_landmarks_survive_as_the_model_predicts(delete_below: float) -> No
         seen = rng.random(num) < model.detection
         slam.step([None], [Measurements(points[seen], descriptors[seen])], [names[seen]])
         alive &= np.isin(names, slam.map().ids)
-    bound = model.deletion_bound(looks)
+    bound = deletion_bound(model, looks)
     assert bound < 0.1
     assert np.count_nonzero(~alive) <= stats.binom.ppf(1.0 - 1e-6, num, bound)
 
@@ -391,7 +407,7 @@ def test_landmarks_doubted_by_both_filters_are_deleted_at_the_next_miss() -> Non
     a, b = standing(model), standing(model)
     for slam in (a, b):
         slam.step([None], [frame(0, 1)])
-        for _ in range(model.misses_to_delete(0.0) - 1):
+        for _ in range(misses_to_delete(model, 0.0) - 1):
             slam.step([None], [frame(0)])
     joint, _ = merge_filters(a, b, aligned(), np.array([[0, 0], [1, 1]]), np.random.default_rng(0))
     np.testing.assert_array_equal(joint.map().ids, [0, 1])

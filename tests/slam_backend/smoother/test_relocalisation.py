@@ -9,7 +9,7 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Relocalisation
 from slam_backend.geometry import compose
 from slam_backend.models.measurements import Measurements
-from studies.circle_world import MOTION, MOVE, circle_log
+from studies.filters.circle_world import MOTION, MOVE, circle_log
 
 AT, JUMP = 150, np.array([3.0, 2.0, 1.0])
 SOON = 110  # two rejuvenations: the first may fail

@@ -10,7 +10,7 @@ import pytest
 from training.bench.speed import filter as compile_timing
 from training.bench.speed.config import FilterSpeedConfig
 from training.bench.speed.filter import KERNELS, SNAPSHOTS, STEP, STUDY, trials
-from training.experiments.timing import processor, time_calls, timing_ms
+from training.experiments.machine.timing import processor, time_calls, timing_ms
 
 TINY = ("--particles", "5,9", "--landmarks", "40", "--measurements", "3", "--robots", "1,2", "--steps", "4")
 

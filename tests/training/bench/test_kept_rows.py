@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from training.commands._plan import write_leaderboard
+from training.commands.helpers.plan import write_leaderboard
 
 ROOT = Path(__file__).parents[3]
 KEPT = sorted(each.parent for each in (ROOT / "benchmarks" / "vslam-bench-v1").glob("*/config.toml"))

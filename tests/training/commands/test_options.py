@@ -14,10 +14,10 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from training.commands import _progress
-from training.commands._options import numbers, options, words
-from training.commands._progress import TrialSet, run_trial_set, share_progress, trial_progress
-from training.commands._run_folder import Call
+from training.commands.helpers import progress
+from training.commands.helpers.options import numbers, options, words
+from training.commands.helpers.progress import TrialSet, run_trial_set, share_progress, trial_progress
+from training.commands.helpers.run_folder import Call
 from training.experiments.config import ExperimentConfig, Positive, option, setting
 from training.experiments.run_folder import RunFolder
 from training.experiments.trial_store import open_folder
@@ -190,7 +190,7 @@ def test_a_bar_counts_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     import numpy as np  # noqa: F401   # a library with threads
     from threadpoolctl import threadpool_info
 
-    monkeypatch.setattr(_progress, "REDRAW_S", 0.0)
+    monkeypatch.setattr(progress, "REDRAW_S", 0.0)
     shown = Console(file=io.StringIO(), width=100, force_terminal=True)
     with trial_progress(shown, 10, 4) as (advance, interrupted):
         advance("the fifth")

@@ -13,8 +13,8 @@ from typer.main import get_command
 
 import training
 from training import cli
-from training.experiments.console import make_console, text_column
-from training.experiments.plotting import picture, save_png
+from training.experiments.output.console import make_console, text_column
+from training.experiments.output.plotting import picture, save_png
 
 ROOT = Path(training.__file__).parent
 ODD = "a [b] [/c] [red]d :boom: {x}"  # markup of rich, also a closing tag that nothing opens

@@ -9,7 +9,10 @@ from slam_backend.fastslam.options import PROPOSALS
 from slam_backend.frontend import DESCRIPTORS
 from slam_backend.maps.alignment import METHODS
 from slam_backend.readers.stereo_files import StereoFiles
-from studies import accuracy, alignment, losses, mrclam_pairs, stereo, training_speed
+from studies.filters import accuracy, losses
+from studies.front_end import stereo
+from studies.learning import speed as training_speed
+from studies.merging import alignment, mrclam_pairs
 from training.bench.exploration import config as exploration
 from training.bench.speed import config as speed
 from training.dataset.config import RecordConfig

@@ -10,7 +10,7 @@ from slam_backend.geometry import compose
 from tests.training.report.conftest import ROOM, STEPS, play
 from training.episodes.config import RunConfig
 from training.episodes.runner import run_episode
-from training.experiments.plotting import CHI_SQUARE_95
+from training.experiments.output.plotting import CHI_SQUARE_95
 from training.report import recording as recording_module
 from training.report.content import parts_of_error
 from training.report.recording import RECORDING_FILE, SCORES, EpisodeRecorder, Recording, run_lengths

@@ -16,8 +16,8 @@ pytest.importorskip("tensorboard", reason="tensorboard is not installed: pip ins
 
 from builders.ray_cluster import two_nodes
 
-from training.experiments import cluster as cluster_module
-from training.experiments.cluster import LostWorkerError, connected
+from training.experiments.machine import cluster as cluster_module
+from training.experiments.machine.cluster import LostWorkerError, connected
 from training.rl.checkpoint import stored_checkpoint
 from training.rl.config import TrainConfig
 from training.rl.imitation import Imitation

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray
-from studies.beside_gtsam import one_thread
+from studies.filters.beside_gtsam import one_thread
 from training.stereo_runs.batch_problem import BatchProblem, Estimate
 
 

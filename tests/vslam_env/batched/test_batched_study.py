@@ -5,8 +5,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from studies.batched.fidelity import STUDY, Config, play, trials
 from studies.bounds import gaussian_team
-from studies.fidelity import STUDY, Config, play, trials
 from vslam_env.batched.scoring import Scores
 
 SMALL = Config(

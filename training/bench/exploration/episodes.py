@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from slam_backend.core.validation import argument_error
 from slam_backend.maps.alignment import REASONS
-from training.experiments.tables import csv_text
+from training.experiments.output.tables import csv_text
 
 CSV, PACKED, PARQUET = "episodes.csv", "episodes.csv.gz", "episodes.parquet"
 MOST_BYTES = 64 * 2**20  # of a table of episodes, unpacked: 100,000 rows

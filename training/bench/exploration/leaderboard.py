@@ -16,10 +16,10 @@ from training.bench.exploration.plan import BASE, FLOOR_PLANS, Plan, PlanTrial
 from training.bench.exploration.plan_report import incomplete, markdown, shown
 from training.bench.exploration.verification import COMMAND as VERIFY
 from training.bench.exploration.verification import OUTCOMES, TENTH, replayed
+from training.experiments.output.tables import escaped, markdown_table
 from training.experiments.run_folder import read_config
 from training.experiments.statistics import grouped
 from training.experiments.study import Column, ResultTable
-from training.experiments.tables import escaped, markdown_table
 from training.experiments.trial_store import trial_of
 
 COMMAND = "bench exploration"

@@ -4,7 +4,7 @@ import platform
 from functools import cache
 from importlib.metadata import version
 
-from training.experiments.numerics import numerics
+from training.experiments.machine.numerics import numerics
 
 PACKAGES = ("vslam-env", "numpy", "scipy", "numba", "llvmlite", "opencv-python-headless", "pymunk")
 

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from training.bench.exploration.aggregate import mean_with_interval, performance_profile, strata_of
 from training.bench.exploration.plan import BASE, FLOOR_PLANS, NO_RELAXATION, Plan, PlanTrial
 from training.bench.exploration.players import label
-from training.experiments.plotting import picture, save_png
+from training.experiments.output.plotting import picture, save_png
+from training.experiments.output.study_chart import COLOURS, STYLES
+from training.experiments.output.tables import E_SCALE, escaped, markdown_table
 from training.experiments.statistics import grouped
 from training.experiments.study import Column, Estimate, ResultTable, Statistic
-from training.experiments.study_chart import COLOURS, STYLES
-from training.experiments.tables import E_SCALE, escaped, markdown_table
 from training.experiments.trial_store import trial_of
 
 Rows = Sequence[Mapping[str, Any]]

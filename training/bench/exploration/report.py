@@ -3,8 +3,8 @@
 from training.bench.exploration.config import NO_ORACLE, ExplorationConfig, Trial
 from training.bench.exploration.players import label
 from training.bench.exploration.trials import CURVES, checks, play
+from training.experiments.output.tables import E_SCALE
 from training.experiments.study import Column, Curves, ResultTable, Study, Words
-from training.experiments.tables import E_SCALE
 
 PLACE = ("world", "robots")
 CONDITION = (*PLACE, "policy", "oracle")

@@ -19,8 +19,8 @@ from slam_backend.fastslam.reports import StepReport
 from training.bench.speed.config import FilterSpeedConfig
 from training.bench.speed.workload import LARGE_LOADS, FilterLoad, LoadStep, LoadWorld
 from training.experiments.config import Proposal
+from training.experiments.machine.timing import time_calls, timing_ms
 from training.experiments.study import Chart, Column, Panel, ResultTable, Study, Words
-from training.experiments.timing import time_calls, timing_ms
 
 LARGE_STEPS = 60
 STATE_LOAD = FilterLoad(particles=100, landmarks=300, measurements=15)

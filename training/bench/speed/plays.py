@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.registry import make_policy
 from slam_backend.core.validation import FloatArray
-from training.experiments.timing import clock, no_garbage_collection
+from training.experiments.machine.timing import clock, no_garbage_collection
 from vslam_env import vslam_v1
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.environment import ExplorationEnv

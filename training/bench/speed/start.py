@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from training.bench.speed.config import Part, StartSpeedConfig
+from training.experiments.output.tables import number
 from training.experiments.study import Column, ResultTable, Row, Study
-from training.experiments.tables import number
 
 CORES = 2
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")

@@ -10,8 +10,8 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, check_choice, check_int
 from slam_backend.fastslam.filter import FastSlam
+from training.experiments.machine.timing import no_garbage_collection
 from training.experiments.study import Row
-from training.experiments.timing import no_garbage_collection
 from training.paper.config import Fig6Config
 from training.stereo_runs.runs import FALSE_POINT, Preset, RunSpec, StereoRun, simulate_run
 from training.stereo_runs.scores import (

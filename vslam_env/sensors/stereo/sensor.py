@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float, check_kind
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import LARGEST, SMALLEST, Image
 from slam_backend.models.camera import StereoCamera
@@ -60,9 +60,7 @@ class StereoSensorConfig:
     def __post_init__(self) -> None:
         parts = {"camera": StereoCamera, "textures": TextureConfig, "imaging": ImagingConfig}
         for name, kind in (parts | {"front_end": FrontEndOptions}).items():
-            if not isinstance(getattr(self, name), kind):
-                hint = f"Build one: {kind.__name__}(...)."
-                raise argument_error(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), hint)
+            check_kind(f"stereo.{name}", getattr(self, name), kind)
         check_float("stereo.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
         check_float("stereo.working_distance", self.working_distance, "Give metres.", at_least=0.1, at_most=1e3)
         check_float("stereo.tolerance", self.tolerance, "Give metres.", above=0.0, at_most=1e3)

@@ -1,0 +1,1 @@
+"""Common parts of planners: frontiers that a group divides, and predicted uncertainty of poses."""
