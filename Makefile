@@ -4,7 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: demo test test-all test-nightly checks lint kernels metrics docs wheel kernels-wheel clients compat clean
+.PHONY: demo test test-all test-nightly checks lint kernels metrics docs wheel kernels-wheel smoke image check-tag
+.PHONY: install-from clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy next_best_view --action-type continuous --seed 0
@@ -39,12 +40,31 @@ metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measur
 docs: $(VENV)/.docs  ## build the site in site/; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
-wheel: $(VENV)/.core  ## build the package as a wheel in dist/
-	rm -rf build
-	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+wheel: $(VENV)/bin/python  ## build the source distribution in dist/, and from it the wheel
+	$(PIP) build
+	$(BIN)/python -m build --outdir dist
 
 kernels-wheel: $(VENV)/.core  ## build a wheel of kernels compiled for x86-64-v3 and v4 in dist/; takes minutes
 	$(BIN)/python -m slam_backend.core.compilation.wheel dist slam_backend vslam_env
+
+VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+SMOKE := $(VENV)-smoke/bin/python
+
+smoke:  ## install the wheels of dist/ into an environment of their own, and try them there without the checkout
+	rm -rf $(VENV)-smoke
+	$(PYTHON) -m venv $(VENV)-smoke
+	$(SMOKE) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --find-links dist vslam-env==$(VERSION) vslam-env-kernels==$(VERSION) pytest hypothesis
+	$(SMOKE) tests/packaging/smoke.py --tests
+
+image:  ## build the image of the command line with Docker
+	docker build --tag vslam-env:$(VERSION) .
+
+check-tag:  ## refuse a TAG of a release that is not the version of the package and of the changelog
+	test "$(TAG)" = "v$(VERSION)"
+	grep "^## \[$(VERSION)\] - 20" CHANGELOG.md
+
+install-from:  ## let pages install from VSLAM_WHEEL: a folder or page of wheels, a wheel, or the published name
+	grep -rl --include=*.md --include=*.py --include=*.ipynb "VSLAM_WHEEL=" README.md docs | xargs sed -i 's|VSLAM_WHEEL=[^ "\\]*|VSLAM_WHEEL=$(VSLAM_WHEEL)|'
 
 CLIENTS := torchrl rllib agilerl tianshou benchmarl
 

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +18,8 @@ from slam_backend.core.compilation.cache import cache_folder
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE")
+BUILD_WHEEL = "from setuptools import build_meta; build_meta.build_wheel({folder!r})"
 pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 
 
@@ -30,18 +33,23 @@ def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     return done
 
 
+def source_copy(place: Path) -> Path:
+    """Copy what a wheel is built from to a new folder, and return it."""
+    place.mkdir()
+    for name in SOURCES:
+        shutil.copy(ROOT / name, place)
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, place / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return place
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the wheel of a copy of the checkout."""
     if tuple(map(int, version("setuptools").split(".")[:1])) < (77,):
         pytest.skip("setuptools is older than 77, which the build needs: pip install --upgrade setuptools")
-    copy, built = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, copy)
-    for name in PACKAGES:
-        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-    code = f"from setuptools import build_meta; build_meta.build_wheel({str(built)!r})"
-    run(sys.executable, "-c", code, cwd=copy)
+    copy, built = source_copy(tmp_path_factory.mktemp("source") / "copy"), tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-c", BUILD_WHEEL.format(folder=str(built)), cwd=copy)
     (file,) = built.glob("vslam_env-*.whl")
     return file
 
@@ -99,38 +107,23 @@ def test_a_wheel_holds_the_packages_and_their_data(wheel: Path) -> None:
     }  # fmt: skip
 
 
-def test_the_demo_runs_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
-    """The installed command explores, maps, and writes a folder with a report; it runs the installed files."""
-    python, vslam = installed / "bin" / "python", installed / "bin" / "vslam"
-    code = "import vslam_env, training; print(vslam_env.__file__, training.__file__, vslam_env.__version__)"
-    env_file, training_file, shown = run(python, "-c", code, cwd=tmp_path).stdout.split()
-    assert Path(env_file).is_relative_to(installed)
-    assert Path(training_file).is_relative_to(installed)
-    assert shown == version("vslam-env")
-    assert shown in run(python, "-m", "vslam_env", "--version", cwd=tmp_path).stdout
-    few = ("--world", "office", "--robots", "3", "--policy", "frontier", "--max-seconds", "6", "--particles", "30")
-    done = run(vslam, "run", *few, "--out", "demo", cwd=tmp_path)
-    assert re.search(r"Report: .*report\.html", done.stdout)
-    names = {file.name for file in (tmp_path / "demo").iterdir()}
-    assert names >= {"report.html", "metrics.json", "map.png", "error.png", "video.mp4", "recording.npz", "config.toml"}
-    run(vslam, "report", "demo", cwd=tmp_path)
-    few = ("--world", "hall", "--robots", "1", "--policy", "learned", "--max-seconds", "4", "--particles", "10")
-    run(vslam, "run", *few, "--no-video", "--out", "learned", cwd=tmp_path)
+def test_an_installation_runs_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
+    """Commands, programs of the README and the model that comes along run from the installed files."""
+    said = run(installed / "bin" / "python", ROOT / "tests" / "packaging" / "smoke.py", cwd=tmp_path).stdout
+    parts = ["installation", "first_picture", "programs", "commands"]
+    assert re.findall(r"^(\w+): \d+\.\d s \(", said, re.MULTILINE) == parts
+    assert f"({version('vslam-env')} kernels of " in said
 
 
-def test_the_program_of_the_readme_runs_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
-    """The environment is registered with PettingZoo and Gymnasium, and steps."""
-    program = """
-import gymnasium
-from vslam_env import vslam_v0
-
-env = vslam_v0.parallel_env(world="fig5", num_robots=2, action_type="goal", max_cycles=3)
-observations, infos = env.reset(seed=0)
-while env.agents:
-    actions = {agent: env.action_space(agent).sample(observations[agent]["action_mask"]) for agent in env.agents}
-    observations, rewards, terminations, truncations, infos = env.step(actions)
-print(len(env.belief("robot_0").map.means), gymnasium.spec("vslam_env/SoloExploration-v0").id)
-"""
-    landmarks, name = run(installed / "bin" / "python", "-c", program, cwd=tmp_path).stdout.split()
-    assert int(landmarks) > 0
-    assert name == "vslam_env/SoloExploration-v0"
+def test_the_source_distribution_builds_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
+    """It has the packages, their data and the licence; the wheel built from it is that of the checkout."""
+    code = f"from setuptools import build_meta; print(build_meta.build_sdist({str(tmp_path)!r}))"
+    made = run(sys.executable, "-c", code, cwd=source_copy(tmp_path / "source")).stdout.split()[-1]
+    with tarfile.open(tmp_path / made) as archive:
+        archive.extractall(tmp_path / "unpacked", filter="data")
+    (folder,) = (tmp_path / "unpacked").iterdir()
+    roots = {path.name for path in folder.iterdir()}
+    assert roots == {*PACKAGES, *SOURCES, "PKG-INFO", "setup.cfg", "vslam_env.egg-info"}
+    run(sys.executable, "-c", BUILD_WHEEL.format(folder=str(tmp_path)), cwd=folder)
+    with zipfile.ZipFile(wheel) as first, zipfile.ZipFile(tmp_path / wheel.name) as again:
+        assert sorted(first.namelist()) == sorted(again.namelist())

@@ -15,7 +15,7 @@ import sysconfig
 from base64 import urlsafe_b64encode
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
-from importlib.metadata import version
+from importlib.metadata import distribution, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -88,8 +88,7 @@ def compile_into(folder: str, workers: str, only: str, *packages: str) -> None:
 def _pack(folder: Path, files: Mapping[str, bytes], about: Mapping[str, str]) -> Path:
     """Write a wheel; equal files give equal bytes."""
     python = f"cp{sys.version_info[0]}{sys.version_info[1]}"
-    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
-    tag = f"{python}-{python}{getattr(sys, 'abiflags', '')}-{platform}"
+    tag = f"{python}-{python}{getattr(sys, 'abiflags', '')}-{_platform()}"
     name = f"{PACKAGE}-{about[DISTRIBUTION]}"
     numbers = {"numba": about["numba"], "llvmlite": about["llvmlite"], "python": about["python"].split()[1]}
     metadata = METADATA.format(version=about[DISTRIBUTION], **numbers)
@@ -105,6 +104,13 @@ def _pack(folder: Path, files: Mapping[str, bytes], about: Mapping[str, str]) ->
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, content, ZIP_DEFLATED, compresslevel=9)
     return wheel
+
+
+def _platform() -> str:
+    """Return the platform of the wheel: that of the wheel of llvmlite, without which no kernel is loaded."""
+    lines = (distribution("llvmlite").read_text("WHEEL") or "").splitlines()
+    tags = [line.rsplit("-", 1)[1] for line in lines if line.startswith("Tag: ")]
+    return min(tags, default=sysconfig.get_platform().replace("-", "_").replace(".", "_"))
 
 
 def _digest(content: bytes) -> str:

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -95,6 +96,7 @@ def test_a_wheel_is_tagged_and_pinned(wheel: Path) -> None:
     here = versions()
     tag = f"cp{sys.version_info[0]}{sys.version_info[1]}"
     assert wheel.name.split("-", 2)[2].startswith(f"{tag}-{tag}")
+    assert wheel.stem.rsplit("-", 1)[1] in (distribution("llvmlite").read_text("WHEEL") or wheel.stem)
     with ZipFile(wheel) as archive:
         names = archive.namelist()
         metadata = archive.read(next(name for name in names if name.endswith("METADATA"))).decode()
