@@ -91,7 +91,7 @@ def align_maps(
         map_b: Map in frame b.
         method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised. `"svd"`: closed
             form over all candidates. `"icp"`: pairs of closest landmarks, starting from `"svd"`. `"impicp"`: ICP from
-            two starts. `initial_estimates` names the sources; `docs/explanation/alignment.md` compares the methods.
+            two starts. `initial_estimates` names the sources; `docs/explanation/merging.md` compares the methods.
         rng: Generator of the search order; None: a fixed order. The same generator state gives the same result.
         options: Gates and refusal limits; None: the defaults.
 

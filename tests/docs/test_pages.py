@@ -15,10 +15,9 @@ from vslam_env import vslam_v0
 SLOW = (
     "docs/how-to/training.md",
     "docs/how-to/own_study.md",
-    *(f"docs/tutorials/{stem}.md" for stem in ("reinforcement_learning", "own_planner", "train_a_policy")),
+    *(f"docs/tutorials/{stem}.md" for stem in ("reinforcement_learning", "own_planner")),
 )
 NEEDS = {
-    "docs/tutorials/train_a_policy.md": "stable_baselines3",
     "docs/how-to/training.md": "stable_baselines3",
 }
 KINDS = {"python", "console", "text", "sh", "toml"}

@@ -45,7 +45,7 @@ def test_the_page_of_commands_has_all_options(hooks: Any) -> None:
 
 
 @pytest.mark.parametrize(("source", "before", "after"), [
-    ("how-to/own_world.md", "[add](../../CONTRIBUTING.md#a-world-family)", "[add](../CONTRIBUTING.md#a-world-family)"),
+    ("how-to/environment.md", "[add](../../CONTRIBUTING.md#a-world-family)", "[add](../CONTRIBUTING.md#a-world-family)"),
     ("tutorials/own_log.md", "[example](../../examples/own_log.py)", "example (`examples/own_log.py`)"),
     ("tutorials/own_log.md", "[`examples/own_log.py`](../../examples/own_log.py)", "`examples/own_log.py`"),
     ("README.md", "[lab](lab/README.md)", "[lab](lab/README.md)"),
