@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: demo test test-all test-nightly checks lint kernels metrics docs wheel kernels-wheel clients compat clean
+.PHONY: demo test test-all test-nightly checks lint kernels metrics docs notebooks wheel kernels-wheel clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
@@ -38,6 +38,10 @@ metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measur
 
 docs: $(VENV)/.docs  ## build the site in site/; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+notebooks: $(VENV)/.docs  ## run the notebooks in Jupyter and keep their output; takes minutes
+	$(PIP) --editable ".[docs,jax]"
+	$(BIN)/python -m studies.notebooks
 
 wheel: $(VENV)/.core  ## build the package as a wheel in dist/
 	rm -rf build
