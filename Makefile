@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-com
 .PHONY: demo test test-all test-nightly checks lint kernels metrics docs notebooks wheel kernels-wheel clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
-	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
+	$(BIN)/vslam run --world office --robots 3 --policy next_best_view --action-type continuous --seed 0
 
 PYTEST := -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 

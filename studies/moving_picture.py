@@ -2,7 +2,7 @@
 
 python -m studies.moving_picture                  # docs/figures/episode.webp, about a minute
 python -m studies.moving_picture --seed 1 --out other.webp
-python -m studies.moving_picture --policy learned --beside next_best_view --out both.webp   # the same world twice
+python -m studies.moving_picture --policy learned --beside frontier --out both.webp   # the same world twice
 python -m studies.moving_picture --preset hard --beside-file old.webp --out both.webp       # beside another version
 """
 
@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "figures" / "episode.webp")
     parser.add_argument("--world", default="office")
     parser.add_argument("--world-split", choices=("train", "validation", "test"))
-    parser.add_argument("--policy", default="frontier")
+    parser.add_argument("--policy", default="next_best_view")
     second = parser.add_mutually_exclusive_group()
     second.add_argument("--beside", metavar="POLICY", help="second policy, in the same world")
     second.add_argument("--beside-file", metavar="WEBP", type=Path, help="moving picture of another version")

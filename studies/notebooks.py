@@ -4,34 +4,34 @@ python -m studies.notebooks                    # all, as `make notebooks` does
 python -m studies.notebooks first_episode ...
 """
 
+import re
 import sys
-import tomllib
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import yaml
 from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "notebooks"
 COLOURS = 64  # of a picture
 TIMEOUT = 1800  # for one cell, which may compile kernels [s]
+WHEEL = re.compile(r"VSLAM_WHEEL=[^ \n]+")  # in the README; `make install-from` sets it there and here
 INSTALL = """\
 # On Colab this cell installs the package and its compiled kernels; elsewhere it does nothing
 import sys
 
-WHEELS = "https://github.com/{repository}/releases/expanded_assets/v{version}"
 if "google.colab" in sys.modules:
-    %pip install --quiet vslam-env vslam-env-kernels --find-links $WHEELS"""
+    %env {wheel}
+    %pip install --quiet --find-links "$VSLAM_WHEEL" vslam-env vslam-env-kernels"""
 
 
 def install_cell() -> str:
-    """Return the first cell of each notebook, for the repository that `mkdocs.yml` names and the current version."""
-    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return INSTALL.format(repository=site["extra"]["repository"], version=project["version"])
+    """Return the first cell of each notebook, which installs from where the README does."""
+    wheel = WHEEL.search((ROOT / "README.md").read_text(encoding="utf-8"))
+    assert wheel is not None
+    return INSTALL.format(wheel=wheel[0])
 
 
 def executed(notebook: Any) -> Any:

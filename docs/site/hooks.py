@@ -5,6 +5,7 @@ section from the home page, `docs/README.md`. Pages outside of the menu belong t
 """
 
 import json
+import os
 import posixpath
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 ROOT_PAGES = ("CONTRIBUTING.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md")
+REPOSITORY = os.environ.get("GITHUB_REPOSITORY", "")  # ACCOUNT/NAME, in workflows of GitHub
 NOTEBOOKS = DOCS / "notebooks"
 SECTION = re.compile(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 MODULE = re.compile(r"^\| `([\w.]+)` \|", re.MULTILINE)
@@ -21,17 +23,11 @@ PAGE_NAME = re.compile(r"(?:<code>)?(docs/[\w/-]+\.md)(?:</code>)?")
 
 
 def on_config(config: Any) -> Any:
-    """Set the site's address, once `mkdocs.yml` names the repository's account."""
-    if repository := named_repository(config):
-        account, name = repository.split("/")
+    """Set the address of the site where a workflow publishes it."""
+    if REPOSITORY:
+        account, name = REPOSITORY.split("/")
         config.site_url = f"https://{account.lower()}.github.io/{name}/"
     return config
-
-
-def named_repository(config: Any) -> str:
-    """Return ACCOUNT/NAME of the repository on GitHub, or nothing while the account is a placeholder."""
-    repository: str = config.extra["repository"]
-    return "" if repository.startswith("OWNER/") else repository
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -40,16 +36,16 @@ def on_files(files: Any, config: Any) -> Any:
 
     for name in ROOT_PAGES:
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
-    for page, content in made_pages(named_repository(config)).items():
+    for page, content in made_pages().items():
         files.append(File.generated(config, page, content=content))
     return files
 
 
-def made_pages(repository: str = "") -> dict[str, str]:
+def made_pages() -> dict[str, str]:
     """Return paths and contents of all pages that are made here."""
     pages = {"reference/commands.md": commands_page(), **section_pages()}
     for notebook in notebooks():
-        content = notebook_page(json.loads(notebook.read_text(encoding="utf-8")), notebook.name, repository)
+        content = notebook_page(json.loads(notebook.read_text(encoding="utf-8")), notebook.name)
         pages[f"notebooks/{notebook.stem}.md"] = content
     for module in public_modules():
         pages[module_page(module)] = f"---\ntitle: {module}\n---\n::: {module}\n    options:\n      heading_level: 1\n"
@@ -92,7 +88,7 @@ def notebooks() -> list[Path]:
     return sorted(NOTEBOOKS.glob("*.ipynb"))
 
 
-def notebook_page(notebook: Any, name: str, repository: str = "") -> str:
+def notebook_page(notebook: Any, name: str) -> str:
     """Return the page of a notebook: its texts, programs and outputs, without the cell that installs the package."""
     parts = []
     for cell in notebook["cells"]:
@@ -106,8 +102,8 @@ def notebook_page(notebook: Any, name: str, repository: str = "") -> str:
             else:
                 parts.append(f"```text\n{''.join(output['text'])}```")
     how = f'*A notebook: read it here, or <a href="{name}" download>open it in Jupyter</a>'
-    if repository:
-        colab = f"https://colab.research.google.com/github/{repository}/blob/main/docs/notebooks/{name}"
+    if REPOSITORY:
+        colab = f"https://colab.research.google.com/github/{REPOSITORY}/blob/main/docs/notebooks/{name}"
         how += f" or [in Colab]({colab})"
     return "\n\n".join([parts[0], how + ".*", *parts[1:]]) + "\n"
 
@@ -127,7 +123,6 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     source = page.file.src_uri
     here = posixpath.dirname(source) or "."
     folder = "" if source in ROOT_PAGES else posixpath.dirname(f"docs/{source}")
-    repository = named_repository(config)
     page.meta["tags"] = config.extra["keywords"].get(source, [])
     if page.is_homepage:
         page.meta["hide"] = ["navigation", "toc"]
@@ -143,8 +138,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         inside = place if place in ROOT_PAGES else place.removeprefix("docs/").replace(".ipynb", ".md")
         if files.get_file_from_path(inside) is not None and (place in ROOT_PAGES or place.startswith("docs/")):
             return f"[{text}]({posixpath.relpath(inside, here)}{mark}{anchor})"
-        if repository:
-            return f"[{text}](https://github.com/{repository}/blob/main/{place})"
+        if REPOSITORY:
+            return f"[{text}](https://github.com/{REPOSITORY}/blob/main/{place})"
         return f"{text} (`{place}`)" if text.strip("`") != place else text
 
     if source == "reference/api.md":

@@ -51,7 +51,9 @@ class References(HTMLParser):
 @pytest.fixture(scope="module")
 def hooks() -> Any:
     """Return the hooks of the site, which need no mkdocs to be imported."""
-    return load_script(ROOT / CONFIG["hooks"][0])
+    module = load_script(ROOT / CONFIG["hooks"][0])
+    module.REPOSITORY = ""  # also in a workflow
+    return module
 
 
 @pytest.fixture(scope="module")
@@ -147,13 +149,13 @@ def test_links_lead_to_pages_of_the_site(source: str, before: str, after: str, h
     assert rendered(hooks, source, before, known) == after
 
 
-def test_links_lead_to_the_repository_once_its_account_is_known(hooks: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With an account, files outside of the pages, notebooks on Colab and the site's address are known."""
-    monkeypatch.setitem(SETTINGS.extra, "repository", "Someone/vslam_env")
+def test_a_workflow_links_to_its_repository(hooks: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a workflow of GitHub links lead to files of the repository and to Colab, and the site knows its address."""
+    monkeypatch.setattr(hooks, "REPOSITORY", "Someone/vslam_env")
     text = rendered(hooks, "tutorials/own_log.md", "[example](../../examples/own_log.py)", ())
     assert text == "[example](https://github.com/Someone/vslam_env/blob/main/examples/own_log.py)"
     assert hooks.on_config(SETTINGS).site_url == "https://someone.github.io/vslam_env/"
-    page = hooks.made_pages("Someone/vslam_env")["notebooks/first_episode.md"]
+    page = hooks.made_pages()["notebooks/first_episode.md"]
     assert "colab.research.google.com/github/Someone/vslam_env/blob/main/docs/notebooks/first_episode.ipynb" in page
 
 

@@ -23,7 +23,10 @@ CORES = 2
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
 MANY_PARAMETERS = 10
 SETTINGS = ("NUMBA_", "PYTHON", "XDG_", "MPL")  # what variables of the user begin with that change what is timed
-DEMO = ("run", "--world", "office", "--robots", "3", "--policy", "frontier", "--seed", "0")
+DEMO = (
+    "run", "--world", "office", "--robots", "3", "--policy", "next_best_view", "--action-type", "continuous",
+    "--seed", "0",
+)  # fmt: skip
 # Programs print their figures on the last line.
 KERNELS = "import vslam_env; print(vslam_env.warm_up(everything=True, workers={workers}))"
 FIRST_STEPS = """
