@@ -4,8 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: demo test test-all test-nightly checks lint kernels metrics docs wheel kernels-wheel smoke image check-tag
-.PHONY: install-from clients compat clean
+.PHONY: demo test test-all test-nightly checks lint kernels metrics docs notebooks wheel kernels-wheel smoke image
+.PHONY: check-tag install-from clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy next_best_view --action-type continuous --seed 0
@@ -39,6 +39,10 @@ metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measur
 
 docs: $(VENV)/.docs  ## build the site in site/; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+notebooks: $(VENV)/.docs  ## run the notebooks in Jupyter and keep their output; takes minutes
+	$(PIP) --editable ".[docs,jax]"
+	$(BIN)/python -m studies.notebooks
 
 wheel: $(VENV)/bin/python  ## build the source distribution in dist/, and from it the wheel
 	$(PIP) build

@@ -69,4 +69,4 @@ plt.show()
 belief = jax.tree.map(lambda values: np.asarray(values[0]), state.episode.belief)
 held = belief.counts >= 2
 print(f"{held.sum()} landmarks, groups {belief.groups.tolist()}")
-print("first places [m]:", belief.places[held][:3].round(2).tolist())
+print("first places [m]:", belief.places[held][:3].astype(float).round(2).tolist())
