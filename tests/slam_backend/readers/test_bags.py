@@ -412,7 +412,7 @@ def test_definitions_of_a_bag_are_words_alone(tmp_path: Path, monkeypatch: pytes
 
 def test_paths_that_are_no_bags_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Missing paths, other files and folders are refused, a folder with the name of a bag in it."""
-    with pytest.raises(ValueError, match=r"path: expected a bag \(.bag, .mcap, .db3, or a folder .*, got no such path"):
+    with pytest.raises(ValueError, match=r"path: expected a bag \(.bag, .mcap, .db3, or a folder .*, got no such file"):
         bag_topics(tmp_path / "none.bag")
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(ValueError, match=r"path: expected a bag .*notes.txt"):
