@@ -14,11 +14,16 @@ from slam_backend.core.files import MAX_BYTES, read_file
 
 HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 KINDS = "biufUS"  # dtype kinds of numbers and texts; objects would be pickles
+ARCHIVE = b"PK"  # first bytes
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # zipfile unpacks a part of these, but all of other members
 
 
 class UnreadableArchiveError(ValueError):
     """File that is not an intact archive of plain arrays."""
+
+
+class OtherKindError(UnreadableArchiveError):
+    """File that is no archive at all."""
 
 
 def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDArray[np.generic]]:
@@ -31,9 +36,13 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDA
     Raises:
         UnreadableArchiveError: If the file is no such archive, is damaged, holds other data than numbers and texts, or
             unpacks to more than `MAX_BYTES`, or is compressed as numpy does not.
+        OtherKindError: If it is no archive.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(read_file(path))) as archive:
+        content = read_file(path)
+        if not content.startswith(ARCHIVE):
+            raise OtherKindError("it is no archive")
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
             wanted = {name: members[name] for name in (members if names is None else names) if name in members}
             if sum(member.file_size for member in wanted.values()) > MAX_BYTES:

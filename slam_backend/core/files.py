@@ -126,6 +126,19 @@ def checked_path(path: Any, name: str = "path") -> Path:
     return Path(path)
 
 
+def missing_error(name: str, expected: str, path: AnyPath, more: str = "") -> ValueError:
+    """Return the error of a path at which there is no file.
+
+    Args:
+        name: The argument that gave the path.
+        expected: Description of the file.
+        path: The path.
+        more: Further advice, a full sentence.
+    """
+    got = "a folder" if Path(path).is_dir() else "no such file"
+    return argument_error(name, expected, got, f"Check {str(path)!r}. {more}".rstrip())
+
+
 @contextmanager
 def os_errors_as_argument_errors(path: AnyPath, name: str) -> Iterator[None]:
     """Turn a system error within a block that writes a file into a `ValueError` with the reason."""

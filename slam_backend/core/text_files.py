@@ -14,7 +14,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from slam_backend.core.files import checked_path
+from slam_backend.core.files import checked_path, missing_error
 from slam_backend.core.validation import argument_error
 
 MOST_MEGABYTES = 1024  # of a log; a million rows of TUM take 100
@@ -55,7 +55,7 @@ def existing_file(path: str | PathLike[str], name: str = "path", kind: str = "a 
     except OSError as error:  # e.g. a name too long for the system
         raise argument_error(name, kind, path, f"Check the path: {error.strerror}.") from error
     if not exists:
-        raise argument_error(name, kind, path, "Check the path: the file does not exist.")
+        raise missing_error(name, kind, path)
     return path
 
 

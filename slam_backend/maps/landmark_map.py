@@ -9,10 +9,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.array_files import read_arrays
+from slam_backend.core.array_files import OtherKindError, read_arrays
 from slam_backend.core.files import checked_path, write_file
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import existing_file
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_int
 from slam_backend.geometry import rotate_covariances, transform_points
 from slam_backend.maps.map_files import to_csv, to_ply
@@ -259,15 +260,17 @@ class LandmarkMap:
         Raises:
             ValueError: If the file is missing, broken, of another kind or of another format version.
         """
-        path, expected = checked_path(path), "a file written by LandmarkMap.save"
-        if not Path(path).is_file():
-            raise argument_error("path", expected, "no such file", f"Check the path {str(path)!r}.")
+        expected = "a map (.npz) that LandmarkMap.save wrote"
+        path = existing_file(path, kind=expected)
         hint = f"Save the map again; {str(path)!r} cannot be used."
         try:
-            found = read_arrays(Path(path))
+            found = read_arrays(path)
             kind, version = str(found["format"]), int(found["version"])
             arrays = {name: found[name] for name in FIELDS} if version == FORMAT_VERSION else {}
-        except (ValueError, KeyError, TypeError, OverflowError) as error:
+        except (OtherKindError, KeyError) as error:
+            hint = f"Check {str(path)!r}{'' if path.suffix == '.npz' else ': only .npz is read back'}."
+            raise argument_error("path", expected, "a file of another kind", hint) from error
+        except (ValueError, TypeError, OverflowError) as error:
             raise argument_error("path", expected, "a broken file", hint) from error
         if kind != FORMAT or version != FORMAT_VERSION:
             raise argument_error("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", hint)

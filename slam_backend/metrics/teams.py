@@ -99,15 +99,18 @@ def score_team(
         ValueError: If there is no robot, numbers of paths differ, a path has no pose at a true one's time, or one kind
             of landmarks is missing.
     """
-    if not estimated or len(estimated) != len(truth):
+    if not estimated:
+        raise argument_error("estimated", "at least one path", "no path", "Give the path of each robot.")
+    if len(estimated) != len(truth):
         hint = "Give one true path for each estimated one, in the same order."
-        raise argument_error("truth", f"{len(estimated)} paths, at least one", len(truth), hint)
+        raise argument_error("truth", f"as many paths as estimated ones, {len(estimated)}", len(truth), hint)
     check_int("delta", delta, 1, "Compare motions over at least one pose.")
     pairs = []
     for robot, (guess, true) in enumerate(zip(estimated, truth, strict=True)):
         rows = match_times(guess.times, true.times, max_gap)
         if not len(rows):
-            got = f"{guess.times[0]:.3f} to {guess.times[-1]:.3f} s, and {true.times[0]:.3f} to {true.times[-1]:.3f} s"
+            spans = (f"{path.times[0]:.3f} to {path.times[-1]:.3f} s" for path in (guess, true))
+            got = "a path from {}, a true one from {}".format(*spans)
             hint = f"Path {robot} has no pose within {max_gap:g} s of a true one: do both have one clock?"
             raise argument_error("estimated", "paths that overlap in time", got, hint)
         pairs.append((guess.poses[rows[:, 0]], true.poses[rows[:, 1]]))
@@ -123,7 +126,7 @@ def score_team(
     score = None
     if (landmarks is None) != (true_landmarks is None):
         missing = "landmarks" if landmarks is None else "true_landmarks"
-        raise argument_error(missing, "positions", "none", "Give both kinds of landmarks, or neither.")
+        raise argument_error(missing, "positions", "no positions", "Give a map and true landmarks, or neither.")
     if landmarks is not None and true_landmarks is not None:
         points, truths = _points("landmarks", landmarks), _points("true_landmarks", true_landmarks)
         if 2 in (points.shape[1], truths.shape[1]):  # heights that only one side has do not count

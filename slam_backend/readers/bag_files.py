@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from slam_backend.core.files import MAX_BYTES, checked_path
+from slam_backend.core.files import MAX_BYTES, checked_path, missing_error
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import argument_error, did_you_mean, is_argument_error
 
@@ -154,7 +154,7 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         )
     file = checked_path(path)
     if not file.exists():
-        raise argument_error("path", BAGS, "no such path", f"Check {str(path)!r}.")
+        raise missing_error("path", BAGS, path)
     is_bag = (file / "metadata.yaml").is_file() if file.is_dir() else file.suffix in (".bag", ".mcap", ".db3")
     if not is_bag:
         inside = [each.name for each in sorted(file.glob("*")) if each.suffix in (".bag", ".mcap", ".db3")][:3]

@@ -221,14 +221,14 @@ LACKING = {
 }
 
 
-def uses(kind: str) -> str:
-    """Return what a topic of a type can be, as words for a table; empty: nothing.
+def uses(kind: str) -> list[str]:
+    """Return what a topic of a type can be.
 
     >>> uses("nav_msgs/Odometry"), uses("sensor_msgs/Image")
-    ('odometry, truth', '')
+    (['odometry', 'truth'], [])
     """
     tables = (("odometry", {*POSES, *TWISTS}), ("landmarks", LANDMARKS), ("truth", POSES), ("camera", CAMERAS))
-    return ", ".join(name for name, known in tables if kind in known)
+    return [name for name, known in tables if kind in known]
 
 
 def check_type(argument: str, topic: str, kind: str, known: Iterable[str]) -> str:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,11 +33,12 @@ from slam_backend.readers.bag_messages import (
 from slam_backend.readers.conversions import HOLD, integrate_commands, points_from_polar
 from slam_backend.readers.mrclam import SightingNoise
 from slam_backend.readers.plausibility import check_rate, repetition_note
-from slam_backend.readers.range_bearing import by_step, even_times, first_of_each, motions, nearest_steps
+from slam_backend.readers.range_bearing import RobotReadings, by_step, even_times, first_of_each, motions, nearest_steps
 from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 from slam_backend.trajectory import LEAST_NORM, MOST_NORM, Trajectory
 
 MOST_TILT = 0.2  # [rad] of poses that count as planar
+MOST_TRIED = 10_000  # messages of a topic that are searched for a first landmark
 MOST_POINTS = 5_000_000  # landmarks seen in a topic
 NEAREST = 0.1  # [m]; landmarks are assumed to be at least this far from the sensor where noise grows with distance
 MOST_SQUINT = 0.2  # [rad] between the axis of a camera and x of the base
@@ -45,18 +47,13 @@ Kind = Literal["identities", "descriptors", "positions"]
 
 @short_repr
 @dataclass(frozen=True, slots=True, eq=False)
-class BagRobot:
-    """Readings of one robot, step by step, and its true path.
+class BagRobot(RobotReadings):
+    """Readings of one robot, and its true path.
 
     Attributes:
-        odometry: (T, 3) float64 [m, m, rad]. Motion since the previous step, in the previous robot frame; the first is
-            zero.
-        measurements: T entries; None for a step without landmarks. Points in camera axes with covariances.
         truth: True poses; None: unknown.
     """
 
-    odometry: FloatArray
-    measurements: tuple[Measurements | None, ...]
     truth: Trajectory | None
 
 
@@ -110,14 +107,55 @@ class _Seen(NamedTuple):
     descriptors: NDArray[np.float32]  # (m, d)
 
 
-def bag_topics(path: str | Path) -> list[tuple[str, str, int, str]]:
+def bag_topics(path: str | Path, tag_frames: str = TAG_FRAMES) -> list[tuple[str, str, int, str]]:
     """Return the topics of a bag: name, type, number of messages, and what they can be.
+
+    Topics of landmarks are read up to the first landmark: of those in `/tf` names must fit, and a map in the frame of
+    all odometry is none that a sensor sees.
+
+    Args:
+        path: See `load_bag`.
+        tag_frames: See `load_bag`.
 
     Raises:
         ValueError: If there is no bag at the path, or it is damaged, or rosbags is not installed.
     """
     with open_bag(path) as bag:
-        return [(name, topic.kind, topic.messages, uses(topic.kind)) for name, topic in bag.topics.items()]
+        topics = {name: uses(topic.kind) if topic.messages else [] for name, topic in bag.topics.items()}
+        fixed = [_first_fixed(bag, name) for name, known in topics.items() if "odometry" in known]
+        for name, known in topics.items():
+            if "landmarks" in known and not _has_landmarks(bag, name, tag_frames, fixed):
+                known.remove("landmarks")
+        return [(name, *bag.topics[name], ", ".join(known)) for name, known in topics.items()]
+
+
+def _first_fixed(bag: Bag, topic: str) -> set[str]:
+    """Return the frame in which the first message of a topic of odometry has its pose; none for velocities."""
+    if (parse := POSES.get(bag.topics[topic].kind)) is None:
+        return set()
+    try:
+        with closing(bag.messages("odometry", topic)) as messages:
+            pose = parse(next(messages))
+    except ValueError:  # `load_bag` says what is wrong with the topic
+        return set()
+    return {pose.frame} - {pose.child, ""}
+
+
+def _has_landmarks(bag: Bag, topic: str, tag_frames: str, fixed: Sequence[set[str]]) -> bool:
+    """Return whether the first landmarks of a topic can be read with one of the topics of odometry, if there are any.
+
+    Args:
+        fixed: Frames in which each topic of odometry has its poses.
+    """
+    parse = LANDMARKS[bag.topics[topic].kind]
+    try:
+        with closing(bag.messages("landmarks", topic)) as messages:
+            for message in islice(messages, MOST_TRIED):
+                if frames := {each.frame for each in parse(message, tag_frames) if len(each.points)}:
+                    return not fixed or any(frames.isdisjoint(each) for each in fixed)
+    except ValueError:  # `load_bag` says what is wrong with the topic
+        return False
+    return bag.topics[topic].messages > MOST_TRIED
 
 
 def load_bag(

@@ -10,10 +10,9 @@ from slam_backend.core.files import checked_path
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.text_files import data_lines, existing_file, line_error, parse_numbers, read_text
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
-from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import HOLD, integrate_commands
 from slam_backend.readers.plausibility import MOST_BEARING, check_rate, repetition_note, unit_notes
-from slam_backend.readers.range_bearing import even_times, frames_at, motions
+from slam_backend.readers.range_bearing import RobotReadings, even_times, frames_at, motions
 from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 from slam_backend.trajectory import Trajectory
 
@@ -300,20 +299,14 @@ class Drive:
 
 @short_repr
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotSteps:
-    """Readings of one robot, step by step.
+class RobotSteps(RobotReadings):
+    """Readings of one robot; descriptors are one-hot, in the order of `MrclamLog.subjects`.
 
     Attributes:
-        odometry: (T, 3) float64 [m, m, rad]. Motion since the previous step, in the previous robot frame; the first is
-            zero.
         reckoned: (T, 3) float64 [m, m, rad]. Dead reckoning of the commands, own start frame.
-        measurements: T entries; None for a step without landmarks. Descriptors are one-hot, in the order of
-            `MrclamLog.subjects`.
     """
 
-    odometry: FloatArray
     reckoned: FloatArray
-    measurements: tuple[Measurements | None, ...]
 
 
 @short_repr
@@ -371,4 +364,4 @@ def _robot_steps(
     descriptors = np.eye(len(subjects), dtype=np.float32)[column]
     seen, variances = log.sightings[:, [0, 2, 3]], noise.variances(log.sightings[:, 2])
     frames = frames_at(times, pose_at, seen, variances, descriptors, column)
-    return RobotSteps(motions(pose_at(times)), reckoned, frames)
+    return RobotSteps(motions(pose_at(times)), frames, reckoned)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.files import checked_path, write_file
-from slam_backend.core.text_files import data_lines, line_error, parse_numbers, place, read_text
+from slam_backend.core.text_files import data_lines, existing_file, line_error, parse_numbers, place, read_text
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_kind
 from slam_backend.geometry import between, compose, transform_points
 from slam_backend.pose_graph import LETTERS, Factors, PoseGraph, positive_definite
@@ -20,6 +20,7 @@ from slam_backend.pose_graph import LETTERS, Factors, PoseGraph, positive_defini
 MOST_MEGABYTES = 64  # of a file; 50,000 poses with 500,000 sightings take 60
 LARGEST_ID = 2**62
 EXACT = 1e-12  # variance of the prior that stands for a fixed pose in pyfg, which has no FIX
+GRAPHS = "a pose graph (.g2o, .pyfg, .fg)"
 SUFFIXES = {".g2o": "g2o", ".pyfg": "pyfg", ".fg": "pyfg"}
 VERTICES = {"VERTEX_SE2": 3, "VERTEX_XY": 2}
 # Records of measurements: field of `PoseGraph`, kinds of the nodes, and length of the value
@@ -54,7 +55,7 @@ def read_graph(path: str | Path, name: str = "path") -> PoseGraph:
         ValueError: If the file is missing or too large, has a record of another type, a malformed line, a number that
             is not finite, a matrix that is not positive definite, or an id that is unknown or repeated; with the line.
     """
-    kind = _format(path, name)
+    kind = _format(existing_file(path, name, GRAPHS), name)
     text = read_text(path, name, f"a pose graph ({kind})", MOST_MEGABYTES)
     reader = _Reader(path, name, PYFG if kind == "pyfg" else G2O, kind == "pyfg")
     for number, line in data_lines(text):
@@ -88,7 +89,7 @@ def _format(path: str | Path, name: str) -> str:
     """Return "g2o" or "pyfg", or raise."""
     suffix = checked_path(path, name).suffix.lower()
     if suffix not in SUFFIXES:
-        raise argument_error(name, "a pose graph (.g2o, .pyfg, .fg)", Path(path), "Give it the suffix of its format.")
+        raise argument_error(name, GRAPHS, Path(path), "Give it the suffix of its format.")
     return SUFFIXES[suffix]
 
 
@@ -128,6 +129,9 @@ class _Reader:
             if not words:
                 raise line_error(self._name, "FIX with an id", line, self._path, number)
             self._fixed += [(number, self._node(word, "pose", number, line)) for word in words]
+        elif not tag.isupper():
+            hint = f"Check {place(self._path, number)}: graphs have records such as VERTEX_SE2 or EDGE_SE2."
+            raise argument_error(self._name, GRAPHS, repr(line), hint)
         else:
             known = ", ".join(dict.fromkeys([*VERTICES, *self._records, *([] if self._named else ["FIX"])]))
             hint = f"Remove or convert such records, as in {place(self._path, number)}."

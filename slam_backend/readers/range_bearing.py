@@ -23,6 +23,21 @@ DT_HINT = "Give seconds between steps."
 
 @short_repr
 @dataclass(frozen=True, slots=True, eq=False)
+class RobotReadings:
+    """Readings of one robot, step by step.
+
+    Attributes:
+        odometry: (T, 3) float64 [m, m, rad]. Motion since the previous step, in the previous robot frame; the first is
+            zero.
+        measurements: T entries; None for a step without landmarks. Points in camera axes with covariances.
+    """
+
+    odometry: FloatArray
+    measurements: tuple[Measurements | None, ...]
+
+
+@short_repr
+@dataclass(frozen=True, slots=True, eq=False)
 class RangeBearingSteps:
     """One robot's log as steps at common times.
 

@@ -206,44 +206,42 @@ def to_optical(points: Any) -> Any:
     return (points - np.array(OPTICAL[0])) @ ROBOT_FROM_OPTICAL
 
 
+def _array(bag: Writer, view: Views, frame: str, kind: str, entry: Callable[..., Any], *between: Any) -> Any:
+    """Return a message of a header, other fields, and an entry for each landmark: `entry(header, id, point)`."""
+    header = bag.header(view.time, frame)
+    found = [entry(header, int(number), point) for number, point in zip(view.ids, view.points, strict=True)]
+    return bag.make(kind, header, *between, found)
+
+
 def tags(bag: Writer, view: Views, frame: str = "base_link", covariance: Any = None) -> Any:
     """Return an `apriltag_ros/AprilTagDetectionArray`."""
-    header = bag.header(view.time, frame)
-    found = [
-        bag.make(
-            "apriltag_ros/AprilTagDetection", np.array([number], np.int32), np.array([0.1]),
-            bag.make(
-                "geometry_msgs/PoseWithCovarianceStamped", header, bag.with_covariance(bag.pose(point), covariance)
-            ),
-        )
-        for number, point in zip(view.ids, view.points, strict=True)
-    ]  # fmt: skip
-    return bag.make("apriltag_ros/AprilTagDetectionArray", header, found)
+
+    def entry(header: Any, number: int, point: Any) -> Any:
+        pose = bag.with_covariance(bag.pose(point), covariance)
+        posed = bag.make("geometry_msgs/PoseWithCovarianceStamped", header, pose)
+        return bag.make("apriltag_ros/AprilTagDetection", np.array([number], np.int32), np.array([0.1]), posed)
+
+    return _array(bag, view, frame, "apriltag_ros/AprilTagDetectionArray", entry)
 
 
 def alvar(bag: Writer, view: Views, frame: str = "base_link") -> Any:
     """Return an `ar_track_alvar_msgs/AlvarMarkers`."""
-    header = bag.header(view.time, frame)
-    found = [
-        bag.make(
-            "ar_track_alvar_msgs/AlvarMarker", header, int(number), 1,
-            bag.make("geometry_msgs/PoseStamped", header, bag.pose(point)),
-        )
-        for number, point in zip(view.ids, view.points, strict=True)
-    ]  # fmt: skip
-    return bag.make("ar_track_alvar_msgs/AlvarMarkers", header, found)
+
+    def entry(header: Any, number: int, point: Any) -> Any:
+        posed = bag.make("geometry_msgs/PoseStamped", header, bag.pose(point))
+        return bag.make("ar_track_alvar_msgs/AlvarMarker", header, number, 1, posed)
+
+    return _array(bag, view, frame, "ar_track_alvar_msgs/AlvarMarkers", entry)
 
 
 def fiducials(bag: Writer, view: Views, frame: str = "base_link") -> Any:
     """Return a `fiducial_msgs/FiducialTransformArray`."""
-    header = bag.header(view.time, frame)
-    found = [
-        bag.make(
-            "fiducial_msgs/FiducialTransform", int(number), bag.transform(header, "", point).transform, 0.0, 0.0, 0.0
-        )
-        for number, point in zip(view.ids, view.points, strict=True)
-    ]
-    return bag.make("fiducial_msgs/FiducialTransformArray", header, 0, found)
+
+    def entry(header: Any, number: int, point: Any) -> Any:
+        moved = bag.transform(header, "", point).transform
+        return bag.make("fiducial_msgs/FiducialTransform", number, moved, 0.0, 0.0, 0.0)
+
+    return _array(bag, view, frame, "fiducial_msgs/FiducialTransformArray", entry, 0)
 
 
 def detections(bag: Writer, view: Views, frame: str = "base_link", in_box: bool = False) -> Any:

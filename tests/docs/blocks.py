@@ -21,9 +21,9 @@ PAGES = sorted(
     if page.name != "CHANGELOG.md" and (ROOT / "docs" / "lab") not in page.parents  # dated
 )
 FENCE = re.compile(
-    r"(?:^<!-- not run: (?P<why>[^\n]+) -->\n)?^```(?P<kind>[^\n]*)\n(?P<text>.*?)^```$", re.DOTALL | re.MULTILINE
+    r"(?:^<!-- (?P<mark>not run|numbers vary): (?P<why>[^\n]+) -->\n)?^```(?P<kind>[^\n]*)\n(?P<text>.*?)^```$",
+    re.DOTALL | re.MULTILINE,
 )
-FILE_NAME = re.compile(r"# (\w+\.py)\n")
 NUMBER = re.compile(r"-?\d+(?:[.,]\d+)*")
 
 
@@ -34,6 +34,7 @@ class Block:
     kind: str  # `python`, `console` (commands after `$ `, each with its output), `text`, or another word
     text: str
     why: str | None  # Reason why it is not run, from the comment above it
+    varies: bool  # Whether the numbers of its output vary, as the comment above it says
     output: str | None  # Text of the block of kind `text` that follows at once: output of a program
 
     @property
@@ -49,24 +50,34 @@ def blocks(page: Path) -> list[Block]:
     made = []
     for block, after in zip(found, (*found[1:], None), strict=False):
         follows = after is not None and after["kind"] == "text" and not content[block.end() : after.start()].strip()
-        made.append(Block(block["kind"], block["text"], block["why"], after["text"] if after and follows else None))
+        why = block["why"] if block["mark"] == "not run" else None
+        output = after["text"] if after and follows else None
+        made.append(Block(block["kind"], block["text"], why, block["mark"] == "numbers vary", output))
     return made
 
 
-def alike(expected: str, got: str) -> bool:
-    r"""Return whether a text has the expected words; numbers may differ, and `...` stands for any text.
+def alike(expected: str, got: str, exact: bool = True) -> bool:
+    r"""Return whether a text is as expected; `...` stands for any text, such as a time or a path.
 
-    >>> alike("pose 1.0, 2 maps ... end", "pose  3.25,  0 maps and more\nend"), alike("a map", "a cat")
-    (True, False)
+    Args:
+        expected: Text of a page.
+        got: Output of the program.
+        exact: Whether numbers count.
+
+    >>> alike("pose 1.0 in ... s", "pose  1.0\nin 3 s"), alike("pose 1.0", "pose 1.1"), alike("a map", "a cat")
+    (True, False, False)
+    >>> alike("pose 1.0", "pose 1.1", exact=False)
+    True
     """
-    parts = [plain(part) for part in expected.split("...")]
+    parts = [plain(part, exact) for part in expected.split("...")]
     pattern = r"\s*.*?\s*".join(re.escape(part) for part in parts)
-    return re.fullmatch(pattern, plain(got), re.DOTALL) is not None
+    return re.fullmatch(pattern, plain(got, exact), re.DOTALL) is not None
 
 
-def plain(text: str) -> str:
-    """Return a text without the rules of tables, with one sign for each number, and single spaces."""
-    return " ".join(NUMBER.sub("#", re.sub("[─━╸╺]", " ", text)).split())
+def plain(text: str, exact: bool) -> str:
+    """Return a text without the rules of tables, with single spaces; if not exact, with one sign for each number."""
+    words = re.sub("[─━╸╺]", " ", text)
+    return " ".join((words if exact else NUMBER.sub("#", words)).split())
 
 
 def commands(text: str) -> Iterator[tuple[str, str]]:

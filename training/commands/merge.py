@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.commands.helpers.options import Json
+from training.commands.helpers.options import Json, naming
 from training.commands.helpers.run_folder import write_json
 from training.experiments.output.console import make_console
 
@@ -40,7 +40,10 @@ def merge(
 
     check_suffix(out, "out")
     check_writable(out, "out")
-    map_a, map_b = LandmarkMap.load(one), LandmarkMap.load(other)
+    with naming(path="one"):
+        map_a = LandmarkMap.load(one)
+    with naming(path="other"):
+        map_b = LandmarkMap.load(other)
     found = align_maps(map_a, map_b, options=AlignmentOptions(min_inliers=min_inliers, appearance=appearance))
     console, picture = make_console(), out.with_suffix(".png")
     console.print(described(found, map_a, map_b), soft_wrap=True)

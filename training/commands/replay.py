@@ -133,7 +133,7 @@ def replay_bag(call: Call[BagConfig]) -> None:
     config = call.config
     missing = [name for name in ("odometry", "landmarks") if getattr(config, name) is None]
     if missing:
-        _list_topics(call.console, config.path)
+        _list_topics(call.console, config)
     if len(missing) == 1:
         hint = f"Choose a topic above that can be {missing[0]}."
         raise argument_error(missing[0], f"the topic of the {missing[0]}", f"no --{missing[0]}", hint)
@@ -141,7 +141,7 @@ def replay_bag(call: Call[BagConfig]) -> None:
         _replay(call, config, read_bag)
 
 
-def _list_topics(console: Console, path: str) -> None:
+def _list_topics(console: Console, config: BagConfig) -> None:
     """Print the topics of a bag."""
     from rich.table import Table
 
@@ -150,7 +150,7 @@ def _list_topics(console: Console, path: str) -> None:
     table = Table("topic", "type", "messages", "can be", box=None)
     for column in table.columns[:2]:
         column.no_wrap = True
-    for topic, kind, count, use in bag_topics(path):
+    for topic, kind, count, use in bag_topics(config.path, config.tag_frames):
         table.add_row(topic, kind or "several", str(count), use or "-")
     console.print(table)
 

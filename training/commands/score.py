@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.commands.helpers.options import Json, words
+from training.commands.helpers.options import Json, naming, words
 from training.commands.helpers.run_folder import write_json
 from training.experiments.output.console import make_console
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # numerical modules are imported when the command runs, so th
     from slam_backend.core.validation import FloatArray
     from slam_backend.metrics import TeamScore
 
+MAPS = "a map, .npz of this project or .csv with columns x, y and perhaps z"
 COLUMNS = (("x_m", "y_m", "z_m"), ("x", "y", "z"), ("x_m", "y_m"), ("x", "y"))  # of landmarks, with names for them
 
 
@@ -39,16 +40,27 @@ def score(
     evo (evo_ape -a, evo_rpe). The map is moved by the same motion; its landmarks are matched one to one.
     """
     from slam_backend.core.files import check_writable
+    from slam_backend.core.validation import argument_error
     from slam_backend.metrics import score_team
     from slam_backend.trajectory import Trajectory
     from training.experiments.run_folder import plain, to_json
 
     if json is not None and str(json) != "-":
         check_writable(json, "json")
+    if (map_file is None) != (landmarks is None):
+        missing, other = ("landmarks", "map") if landmarks is None else ("map", "landmarks")
+        raise argument_error(missing, f"a file beside --{other}", f"no --{missing}", "Give both, or neither.")
     names = words(estimate)
-    robots, truths = ([Trajectory.load_tum(name) for name in side] for side in (names, words(truth)))
-    held, true = (None if file is None else read_positions(file) for file in (map_file, landmarks))
-    found = score_team(robots, truths, held, true, max_gap=max_gap, delta=delta, gate=gate)
+    with naming(path="truth"):
+        truths = [Trajectory.load_tum(name) for name in words(truth)]
+    with naming(path="estimate"):
+        robots = [Trajectory.load_tum(name) for name in names]
+    with naming(path="map"):
+        held = None if map_file is None else read_positions(map_file)
+    with naming(path="landmarks"):
+        true = None if landmarks is None else read_positions(landmarks)
+    with naming(estimated="estimate"):
+        found = score_team(robots, truths, held, true, max_gap=max_gap, delta=delta, gate=gate)
     print_score(found, [Path(name).name for name in names])
     if json is not None:
         write_json(json, to_json(plain(metrics(found, names))))
@@ -58,16 +70,17 @@ def read_positions(file: Path) -> "FloatArray":
     """Return the positions (n, 2 or 3) [m] in a map of this project, or in a CSV file with named columns.
 
     Raises:
-        ValueError: If the file is missing or damaged, or has no columns of positions.
+        ValueError: If the file is missing, damaged or of another kind, or has no columns of positions.
     """
     from slam_backend.core.text_files import existing_file
     from slam_backend.core.validation import argument_error
     from slam_backend.maps.landmark_map import LandmarkMap
     from slam_backend.readers.tables import read_csv
 
-    if file.suffix == ".npz":
+    if existing_file(file, kind=MAPS).suffix == ".npz":
         return LandmarkMap.load(file).means
-    existing_file(file, kind="a CSV file of positions")
+    if file.suffix != ".csv":
+        raise argument_error("path", MAPS, file, "Only these are read.")
     for names in COLUMNS:
         try:
             return read_csv(file, names).numbers
@@ -75,7 +88,7 @@ def read_positions(file: Path) -> "FloatArray":
             if "with one column" not in str(error):
                 raise
     hint = f"Name the columns of {str(file)!r} in its first line."
-    raise argument_error("path", "columns x, y and perhaps z", "other names", hint)
+    raise argument_error("path", MAPS, "a table without these names", hint)
 
 
 def metrics(found: "TeamScore", names: "tuple[str, ...]") -> dict[str, object]:

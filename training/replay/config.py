@@ -206,6 +206,7 @@ def find_log(path: str | None, below: Path, what: str) -> str:
     Raises:
         ValueError: If the path does not exist, or `path` is None and VSLAM_DATA is not set.
     """
+    from slam_backend.core.files import missing_error
     from slam_backend.core.validation import argument_error
 
     data = os.environ.get("VSLAM_DATA")
@@ -213,6 +214,5 @@ def find_log(path: str | None, below: Path, what: str) -> str:
         raise argument_error("path", what, "no --path", "Give --path, or set VSLAM_DATA.")
     place = str(Path(data or "").resolve() / below) if path is None else path
     if not Path(place).exists():
-        hint = f"Check {place!r}; without --path it is {str(below)!r} in the folder VSLAM_DATA."
-        raise argument_error("path", what, "no such path", hint)
+        raise missing_error("path", what, place, f"Without --path it is {str(below)!r} in the folder VSLAM_DATA.")
     return place

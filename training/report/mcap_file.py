@@ -1,7 +1,6 @@
 """Recordings for ROS 2, Foxglove and rerun (extra `ros`): an episode as an .mcap file."""
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -9,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.files import check_writable, move_file, os_errors_as_argument_errors, resolved
-from slam_backend.core.validation import argument_error
-from training.report.recording import Recording, part_of
+from slam_backend.core.files import move_file, os_errors_as_argument_errors, resolved
+from training.report.recording import Recording, check_export, part_of
 from vslam_env.navigation.occupancy_grid import CELL, FREE, OCCUPIED
 
 WIDTH = 0.04  # of walls [m]
@@ -23,16 +21,8 @@ Message = tuple[float, str, Any]  # time [s], topic, message
 
 
 def check_mcap(file: Path) -> None:
-    """Check that an .mcap file can be written.
-
-    Raises:
-        ValueError: If rosbags is not installed, the name does not end in .mcap, or the file cannot be written.
-    """
-    if find_spec("rosbags") is None:
-        raise argument_error("mcap", "the package rosbags", "no such package", "Install it: pip install rosbags.")
-    if file.suffix.lower() != ".mcap":
-        raise argument_error("mcap", "a name that ends in .mcap", file, "Viewers know their files by this ending.")
-    check_writable(file, "mcap")
+    """Check that an .mcap file can be written, see `check_export`."""
+    check_export(file, "mcap", "rosbags", "rosbags", ".mcap")
 
 
 def write_mcap(recording: Recording, file: Path) -> Path:

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Self
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.array_files import read_arrays
-from slam_backend.core.files import write_file
+from slam_backend.core.files import check_writable, write_file
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.geometry import compose, rotate_covariances
@@ -170,6 +171,26 @@ PARTS = {"sight_ends": "sights", "map_ends": "map_points", "grid_ends": "grid_ru
 
 def _end_of(arrays: Sequence[NDArray[Any]], shape: tuple[int, int]) -> IntArray:
     return np.cumsum([len(array) for array in arrays]).reshape(shape)
+
+
+def check_export(file: Path, option: str, module: str, package: str, suffix: str) -> None:
+    """Check that a recording can be written as the file of a viewer.
+
+    Args:
+        file: The file.
+        option: The option that names it, for errors.
+        module: Module that writes such files.
+        package: Package of this module.
+        suffix: Suffix of such files.
+
+    Raises:
+        ValueError: If the package is not installed, the name has another suffix, or the file cannot be written.
+    """
+    if find_spec(module) is None:
+        raise argument_error(option, f"the package {package}", "no such package", f"Install it: pip install {package}.")
+    if file.suffix.lower() != suffix:
+        raise argument_error(option, f"a name that ends in {suffix}", file, "Viewers know their files by this ending.")
+    check_writable(file, option)
 
 
 def part_of(ends: Array, row: int, robot: int) -> slice:

@@ -1,15 +1,12 @@
 """Recordings for the viewer rerun (extra `rerun`): an episode as a .rrd file."""
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.files import check_writable
-from slam_backend.core.validation import argument_error
-from training.report.recording import Recording, part_of
+from training.report.recording import Recording, check_export, part_of
 from vslam_env.rendering.palette import robot_colour
 
 TIMELINE = "episode"
@@ -19,16 +16,8 @@ Array = NDArray[Any]
 
 
 def check_rerun(file: Path) -> None:
-    """Check that a file for rerun can be written.
-
-    Raises:
-        ValueError: If rerun is not installed, the name does not end in .rrd, or the file cannot be written.
-    """
-    if find_spec("rerun") is None:
-        raise argument_error("rerun", "the package rerun-sdk", "no such package", "Install it: pip install rerun-sdk.")
-    if file.suffix.lower() != ".rrd":
-        raise argument_error("rerun", "a name that ends in .rrd", file, "The viewer knows its files by this ending.")
-    check_writable(file, "rerun")
+    """Check that a file for rerun can be written, see `check_export`."""
+    check_export(file, "rerun", "rerun", "rerun-sdk", ".rrd")
 
 
 def write_rerun(recording: Recording, file: Path) -> Path:

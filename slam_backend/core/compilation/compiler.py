@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
@@ -224,7 +225,7 @@ def compile_kernels(
             lock.acquire()
         tasks = missing_tasks(signatures)  # another process may have compiled them meanwhile
         if tasks and progress is None:
-            announce()
+            announce(len(tasks))
         for done, left in _compiled(divide_tasks(tasks, workers), begun, {} if costs is None else costs):
             if progress is not None:
                 progress(done, len(tasks), left)
@@ -252,7 +253,21 @@ def compile_expected() -> bool:
     """Compile with all cores what the program will call, if it has said so; return whether anything was compiled."""
     global _expected
     needed, _expected = _expected, None
-    return needed is not None and compile_kernels(needed()) > 0.0
+    return needed is not None and compile_kernels(needed(), progress=_shown) > 0.0
+
+
+_shown: Progress | None = None  # what receives the progress of `compile_expected`
+
+
+@contextmanager
+def showing(progress: Progress) -> Iterator[None]:
+    """Give the progress of what is compiled as expected within a block to a function; else one line says that it is."""
+    global _shown
+    before, _shown = _shown, progress
+    try:
+        yield
+    finally:
+        _shown = before
 
 
 def cache_lock() -> "FileLock":

@@ -4,7 +4,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from typing import Any
 
 from numba.core import event as numba_event
@@ -61,10 +60,24 @@ def watch_compilation(tell: Callable[[str], None]) -> Iterator[CompilationListen
         yield watch
 
 
-@cache
-def announce() -> None:
-    """Say once why the program waits: log it with level INFO, or print it on stderr if no logging is configured."""
-    LOGGER.log(logging.INFO if LOGGER.hasHandlers() else logging.WARNING, MESSAGE)
+def message(total: int = 0) -> str:
+    """Return why the program waits, with the number of kernels to compile; 0: not known.
+
+    >>> message(57)
+    'Compiling the kernels (once, one to two minutes) ... 57 in all'
+    """
+    return f"{MESSAGE} {total} in all" if total else MESSAGE
+
+
+_announced = False
+
+
+def announce(total: int = 0) -> None:
+    """Say once why the program waits: log `message` with level INFO, or print it on stderr without any logging."""
+    global _announced
+    if not _announced:
+        LOGGER.log(logging.INFO if LOGGER.hasHandlers() else logging.WARNING, message(total))
+    _announced = True
 
 
 def log_compilation(begin: Callable[[], object] = announce) -> None:

@@ -157,14 +157,16 @@ def test_damaged_files_never_load_as_another_map(tmp_path: Path) -> None:
 
 def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
     """Missing files, text, foreign archives, pickles and newer versions are each refused with one clear error."""
-    with pytest.raises(ValueError, match=r"path: expected a file written by LandmarkMap.save, got no such file"):
+    with pytest.raises(
+        ValueError, match=r"path: expected a map \(.npz\) that LandmarkMap.save wrote, got no such file"
+    ):
         LandmarkMap.load(tmp_path / "missing.npz")
     text, array, foreign = tmp_path / "a.txt", tmp_path / "a.npy", tmp_path / "a.npz"
     text.write_text("not a map")
     np.save(array, np.arange(3))
     np.savez(foreign, means=np.zeros((2, 3)))
-    for path in (text, array, foreign):
-        with pytest.raises(ValueError, match="got a broken file"):
+    for path, cure in ((text, ": only .npz is read back."), (array, ": only .npz is read back."), (foreign, ".")):
+        with pytest.raises(ValueError, match=f"got a file of another kind. Check '{path}'{cure}$"):
             LandmarkMap.load(path)
     proof = tmp_path / "proof"
     forged = fields() | {"means": np.array([Trap(proof)], dtype=object), "format": np.array("vslam landmark map")}

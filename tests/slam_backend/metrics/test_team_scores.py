@@ -87,10 +87,10 @@ def test_heights_that_one_side_lacks_do_not_count() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (([], []), "truth: expected 0 paths, at least one, got 0"),
-        (([path(0)], [path(0), path(1)]), "truth: expected 1 paths, at least one, got 2"),
+        (([], []), "estimated: expected at least one path, got no path"),
+        (([path(0)], [path(0), path(1)]), "truth: expected as many paths as estimated ones, 1, got 2"),
         (([path(0)], [path(0, begin=100.0)]), "estimated: expected paths that overlap in time"),
-        (([path(0)], [path(0)], np.zeros((3, 3))), "true_landmarks: expected positions, got"),
+        (([path(0)], [path(0)], np.zeros((3, 3))), "true_landmarks: expected positions, got no positions"),
         (([path(0)], [path(0)], np.zeros((3, 4)), np.zeros((3, 3))), "landmarks: expected an array of shape"),
     ],
 )

@@ -1,6 +1,7 @@
 """Bags of ROS 1 and ROS 2, written by rosbags: what is read of them, and what is refused."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -289,6 +290,33 @@ def test_topics_are_listed_with_their_use(tmp_path: Path) -> None:
     ]
 
 
+def test_landmarks_are_listed_only_where_the_reader_would_accept_them(tmp_path: Path) -> None:
+    """Not so: frames that are no tags, a map in the frame of the odometry, a scan, and a topic without a landmark."""
+    path, nothing = tmp_path / "circle.mcap", VIEWS[0]._replace(ids=VIEWS[0].ids[:0], points=VIEWS[0].points[:0])
+    with written(path) as bag:
+        write_odometry(bag, seconds=1.0)
+        bags.write_static(bag)
+        for name, message in {
+            "/tf": bags.frames(bag, VIEWS[0]),
+            "/map": bags.cloud(bag, VIEWS[0], "odom"),
+            "/empty": bags.tags(bag, nothing),
+            "/scan": bags.cloud(bag, VIEWS[0]._replace(ids=np.arange(6000), points=np.zeros((6000, 3)))),
+            "/late": bags.tags(bag, nothing),
+        }.items():
+            bag.write(name, 0.0, message)
+        bag.write("/late", 0.5, bags.tags(bag, VIEWS[0]))
+    uses = {name: use for name, _, _, use in bag_topics(path)}
+    assert uses == {
+        "/odom": "odometry, truth", "/tf": "landmarks", "/tf_static": "", "/map": "", "/empty": "", "/scan": "",
+        "/late": "landmarks",
+    }  # fmt: skip
+    assert {name: use for name, _, _, use in bag_topics(path, "marker*")}["/tf"] == ""
+    for name, use in uses.items():
+        if name not in ("/odom", "/late"):
+            with nullcontext() if use else pytest.raises(ValueError, match="landmarks: expected"):
+                load(path, landmarks=[name])
+
+
 def _write_refused(path: Path) -> None:
     """Write a bag of topics, each wrong in one way."""
     with written(path) as bag:
@@ -412,7 +440,7 @@ def test_definitions_of_a_bag_are_words_alone(tmp_path: Path, monkeypatch: pytes
 
 def test_paths_that_are_no_bags_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Missing paths, other files and folders are refused, a folder with the name of a bag in it."""
-    with pytest.raises(ValueError, match=r"path: expected a bag \(.bag, .mcap, .db3, or a folder .*, got no such path"):
+    with pytest.raises(ValueError, match=r"path: expected a bag \(.bag, .mcap, .db3, or a folder .*, got no such file"):
         bag_topics(tmp_path / "none.bag")
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(ValueError, match=r"path: expected a bag .*notes.txt"):

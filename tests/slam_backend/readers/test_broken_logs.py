@@ -121,8 +121,8 @@ CASES: dict[str, list[tuple[Read, str]]] = {
     "MRCLAM": [
         (within("none", load_mrclam), r"a folder.*got no such folder\. Check '.*none'"),
         (load_mrclam, r"got no odometry of any robot\. Check '.*Robot1_Odometry\.dat'"),
-        (mrclam(CODES), r"a file of the MR\.CLAM log, got '.*Barcodes\.dat'\. Check the path"),
-        (mrclam(SEEN), r"got '.*Robot2_Measurement\.dat'\. Check the path: the file does not exist"),
+        (mrclam(CODES), r"a file of the MR\.CLAM log, got no such file\. Check '.*Barcodes\.dat'"),
+        (mrclam(SEEN), r"got no such file\. Check '.*Robot2_Measurement\.dat'"),
         (mrclam(CODES, "# nothing\n"), r"rows \(subject barcode\), got no rows\. .*Barcodes\.dat is empty"),
         (mrclam(CODES, "1 5\n\n6 6.5\n"), r"a whole barcode, got '6 6\.5'\. Correct line 3 of .*Barcodes\.dat"),
         (mrclam(ODOMETRY, "1 2\n"), r"3 numbers \(time velocity angular_velocity\), got '1 2'\. .*line 1"),
@@ -141,7 +141,7 @@ CASES: dict[str, list[tuple[Read, str]]] = {
         (mrclam("Robot2_Groundtruth.dat", "1 0 0\n"), r"4 numbers \(time x y theta\)"),
         (mrclam("Landmark_Groundtruth.dat", "6 0 0 0 0\n"), "of each landmark, got no position of subject 7"),
         *((mrclam(robots=bad), "^robots: expected different numbers") for bad in ((2, 6), (2, 2), ())),
-        (mrclam(robots=(3,)), r"got '.*Robot3_Odometry\.dat'\. Check the path: the file does not exist"),
+        (mrclam(robots=(3,)), r"got no such file\. Check '.*Robot3_Odometry\.dat'"),
         *((mrclam(duration=bad), "^duration: expected a finite number > 0") for bad in (0.0, float("nan"))),
         (lambda folder: mrclam_steps(mrclam()(folder), 0.0), "^dt: expected a finite number > 0"),
         (lambda folder: mrclam_steps(mrclam()(folder), 1e-9), "^dt: expected at most 1,000,000 steps"),
@@ -172,7 +172,7 @@ CASES: dict[str, list[tuple[Read, str]]] = {
         (kitti(b=np.array([{}], object)), "a numpy archive, got a broken file"),
         (poses_of(f"{ROW}\n4 5 6\n"), r"truth: expected 12 finite numbers, .*got '4 5 6'\. .*line 2 of .*00\.txt"),
         (poses_of(f"{ROW}\n"), r"truth: expected 00\.txt with a row for each of 5 frames, got a file of 1"),
-        (lambda folder: load_kitti(write_kitti(folder), folder / "none.txt"), r"of true poses, got '.*none\.txt'"),
+        (lambda folder: load_kitti(write_kitti(folder), folder / "none.txt"), "of true poses, got no such file"),
         (kitti(b=None), "path: expected drive.npz with the arrays .*, got no array 'b'"),
         (kitti(b=np.array(-0.5)), "drive.npz with a positive distance in 'b'"),
         (kitti(time_stamps=np.array([[1.0, 2.0, 3.0, 2.5, 4.0]])), "two or more rising times in 'time_stamps'"),
@@ -183,7 +183,7 @@ CASES: dict[str, list[tuple[Read, str]]] = {
         (kitti(cam_T_imu=np.ones((4, 4))), "a 4 x 4 rigid motion in 'cam_T_imu'"),
     ],
     "TUM": [
-        (within("gone.txt", Trajectory.load_tum), r"a TUM trajectory file, got '.*gone.txt'\. Check the path"),
+        (within("gone.txt", Trajectory.load_tum), r"a TUM trajectory file, got no such file\. Check '.*gone.txt'"),
         *((holding("path.txt", text, Trajectory.load_tum), says) for text, says in (
             ("0 1 2 3\n", r"8 finite numbers .* got '0 1 2 3'.*line 1"), ("0 0 nan 0 0 0 0 1\n", "8 finite numbers"),
             ("0 0 0 0 0 0 0 1\n1 0 x 0 0 0 0 1\n", "got '1 0 x 0 0 0 0 1'.*line 2"),
@@ -195,7 +195,7 @@ CASES: dict[str, list[tuple[Read, str]]] = {
         )),
     ],
     "calibrations": [
-        (within("none.txt", load_kitti_calibration), r"a file of a calibration, got '.*none\.txt'"),
+        (within("none.txt", load_kitti_calibration), r"of a calibration, got no such file\. Check '.*none\.txt'"),
         *((holding("calib.txt", text, load_kitti_calibration), says) for text, says in (
             ("", "calibration: expected calib.txt with two matrices of 12 numbers, got a file with 0"),
             (KITTI.replace("700 0 600 -350", "700 0 x -350"), "got a file with 1"),
@@ -213,7 +213,7 @@ CASES: dict[str, list[tuple[Read, str]]] = {
         (lambda _: Rectifier(eye_at(0.0), eye_at(0.1)).rectify(*IMAGES), r"^right: expected an image of 320 x 240 px"),
     ],
     "CSV": [
-        (within("none.csv", read_csv, ("time",)), r"a CSV file, got '.*none\.csv'\. Check the path"),
+        (within("none.csv", read_csv, ("time",)), r"a CSV file, got no such file\. Check '.*none\.csv'"),
         (csv(b"time\n\xff\xfe\n"), r"in UTF-8, got a file in another encoding\. .*line 2, column 1 of .*log\.csv"),
         (csv("time,v\n1,2\n", delimiter=" "), "delimiter: expected one of"),
         (csv(""), r"log\.csv with a line of names, got no such line\. Check '.*log\.csv'"),

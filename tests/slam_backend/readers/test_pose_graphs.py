@@ -205,9 +205,14 @@ def test_bad_lines_of_pyfg_are_refused(line: str, tmp_path: Path) -> None:
 
 def test_bad_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A missing, empty, too large or otherwise named file is refused in one line, before it is read."""
-    with pytest.raises(ValueError, match=r"path: expected a pose graph \(\.g2o, \.pyfg, \.fg\), got .*a\.txt"):
+    graphs = r"path: expected a pose graph \(\.g2o, \.pyfg, \.fg\), got"
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(ValueError, match=rf"{graphs} .*a\.txt'\. Give it the suffix of its format"):
         read_graph(tmp_path / "a.txt")
-    with pytest.raises(ValueError, match="the file does not exist"):
+    with pytest.raises(ValueError, match=rf"{graphs} no such file\. Check '.*a\.g2o'"):
+        read_graph(tmp_path / "a.g2o")
+    (tmp_path / "a.g2o").write_text("# notes\nsome words\n")
+    with pytest.raises(ValueError, match=rf"{graphs} 'some words'\. Check line 2 of .*a\.g2o: graphs have records"):
         read_graph(tmp_path / "a.g2o")
     (tmp_path / "a.g2o").write_text("# nothing\n")
     with pytest.raises(ValueError, match="path: expected a graph with poses, got no VERTEX_SE2"):

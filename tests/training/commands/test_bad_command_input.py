@@ -70,7 +70,7 @@ BAD: dict[str, dict[str, str]] = {
     },
     "warm-up": {"--workers 0": "workers: expected an int >= 1, got 0."},
     "replay mrclam": {
-        "--path /nowhere": MRCLAM + ", got no such path. Check '/nowhere'; without --path it is ",
+        "--path /nowhere": MRCLAM + ", got no such file. Check '/nowhere'. Without --path it is ",
         "": MRCLAM + ", got no --path. Give --path, or set VSLAM_DATA.",
         "--path . --robots 1;2": f"robots: {LIST} '1;2'.",
         "--path . --robots 7": "robots: expected different numbers from 1 to 5, got (7,).",
@@ -88,7 +88,7 @@ BAD: dict[str, dict[str, str]] = {
     "replay stereo": {"--path none": "path: expected a folder with two stereo pairs (left_img_0.png, "},
     "replay bag": {
         "": "path: expected a value, got 'none'. Give --path.",
-        "--path none.bag": "path: expected a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), got no such path",
+        "--path none.bag": "path: expected a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), got no such file",
         "--path broken.json": "path: expected a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), got '",
         "--path full --odometry /odom --landmarks /tags": "path: expected a bag (.bag, .mcap, .db3, or a folder with ",
         "--path . --dt 0": "dt: expected a finite number > 0, got 0.0. Give seconds, near those between two frames.",
@@ -96,8 +96,8 @@ BAD: dict[str, dict[str, str]] = {
     },
     "replay graph": {
         "": "path: expected a value, got 'none'. Give --path.",
-        "--path none.txt": "path: expected a pose graph (.g2o, .pyfg, .fg), got ",
-        "--path none.g2o": "path: expected a pose graph (g2o), got ",
+        "--path none.g2o": "path: expected a pose graph (.g2o, .pyfg, .fg), got no such file. Check '",
+        "--path broken.json": "path: expected a pose graph (.g2o, .pyfg, .fg), got '",
     },
     "replay MODULE:FUNCTION": {
         "": "path: expected a value, got 'none'. Give --path.",
@@ -113,6 +113,8 @@ BAD: dict[str, dict[str, str]] = {
         "--parts wheel": "wheel: expected the wheel that `make kernels-wheel` writes, got None.",
     },
     "bench exploration": {
+        "--plan none.toml": "plan: expected the path of a TOML file, got no such file. Check 'none.toml'.",
+        "--plan vslam-bench": "plan: expected one of 'vslam-bench-v1', or the path of a TOML file, got 'vslam-bench'.",
         "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
         "--policies no_module:Missing": "policy: expected MODULE:NAME of a policy, got no module 'no_module'.",
         "--policies random_walk@goal": "random_walk@: expected one of 'continuous', 'discrete', 'team', got 'goal'.",
@@ -128,9 +130,9 @@ BAD: dict[str, dict[str, str]] = {
     "paper fig6": {"--robots 16": "measurements: expected an int >= 16, got 15.", "--robots a": f"robots: {LIST} 'a'."},
     "report": {"nowhere": "folder: expected the folder of a run, with config.toml, got no such folder."},
     "score": {
-        "--truth none.txt --estimate none.txt": "path: expected a TUM trajectory file, got 'none.txt'.",
+        "--truth none.txt --estimate none.txt": "truth: expected a TUM trajectory file, got no such file.",
     },
-    "merge": {"none.npz none.npz": "path: expected a file written by LandmarkMap.save, got no such file."},
+    "merge": {"none.npz none.npz": "one: expected a map (.npz) that LandmarkMap.save wrote, got no such file."},
     "compare": {"nowhere elsewhere": "folder: expected the folder of a run, with config.toml, got no such folder."},
     "worlds validate": {
         "castle": "world: expected one of 'office'",

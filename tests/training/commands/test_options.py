@@ -108,7 +108,7 @@ def test_logs_are_looked_for_below_the_folder_of_data(tmp_path: Path, monkeypatc
     log = (Path("park"), "a park's log")
     monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
     with pytest.raises(
-        ValueError, match=r"path: expected a park's log, got no such path\. Check '.*park'; without --path"
+        ValueError, match=r"path: expected a park's log, got no such file\. Check '.*park'\. Without --path"
     ):
         _ = _call(log=log).config
     for name in ("park", "mine"):

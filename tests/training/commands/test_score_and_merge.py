@@ -13,6 +13,7 @@ from slam_backend.geometry import compose, inverse
 from slam_backend.metrics import ate
 
 MOTION = np.array([3.0, -2.0, 0.7])
+WITH_MAP = "--truth t0.txt --estimate r0.txt --map"
 
 
 @pytest.fixture
@@ -56,23 +57,48 @@ def test_a_team_is_scored_under_one_alignment(vslam: Any, files: Path) -> None:
     assert found["ate_m"] == pytest.approx(ate(*both).aligned, rel=1e-12)
 
 
+MAPS = "expected a map, .npz of this project or .csv with columns x, y and perhaps z, got"
+TUM = "expected a TUM trajectory file, got"
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--truth", "t0.txt", "--estimate", "r0.txt,r1.txt"), "truth: expected 2 paths"),
-        (("--truth", "none.txt", "--estimate", "r0.txt"), "path: expected a TUM trajectory file"),
-        (("--truth", "t0.txt", "--estimate", "r0.txt", "--max-gap", "0.001"), "expected paths that overlap in time"),
-        (("--truth", "t0.txt", "--estimate", "r0.txt", "--map", "b.npz"), "true_landmarks: expected positions"),
-        (("--truth", "t0.txt", "--estimate", "r0.txt", "--map", "t0.txt", "--landmarks", "l.csv"), "path: expected"),
-        (("--truth", "t0.txt", "--estimate", "r0.txt", "--delta", "0"), "delta: expected an int >= 1"),
-        (("--truth", "t0.txt", "--estimate", "r0.txt", "--json", "no/such/file.json"), "json: expected"),
+        ("--truth t0.txt --estimate r0.txt,r1.txt", "truth: expected as many paths as estimated ones, 2, got 1."),
+        ("--truth t0.txt,t1.txt --estimate r0.txt", "truth: expected as many paths as estimated ones, 1, got 2."),
+        ("--truth t0.txt,none.txt --estimate r0.txt,r1.txt", f"truth: {TUM} no such file. Check 'none.txt'."),
+        ("--truth t0.txt --estimate none.txt", f"estimate: {TUM} no such file. Check 'none.txt'."),
+        ("--truth t0.txt --estimate .", f"estimate: {TUM} a folder. Check '.'."),
+        (
+            "--truth t0.txt --estimate r0.txt --max-gap 0.001",
+            "estimate: expected paths that overlap in time, got a path",
+        ),
+        (
+            "--truth t0.txt --estimate r0.txt --map b.npz",
+            "landmarks: expected a file beside --map, got no --landmarks.",
+        ),
+        (
+            "--truth t0.txt --estimate r0.txt --landmarks l.csv",
+            "map: expected a file beside --landmarks, got no --map.",
+        ),
+        (f"{WITH_MAP} t0.txt --landmarks l.csv", f"map: {MAPS} 't0.txt'. Only these are read."),
+        (f"{WITH_MAP} gone.csv --landmarks l.csv", f"map: {MAPS} no such file. Check 'gone.csv'."),
+        (f"{WITH_MAP} b.npz --landmarks odd.csv", f"landmarks: {MAPS} a table without these names. Name the columns"),
+        (
+            f"{WITH_MAP} broken.npz --landmarks l.csv",
+            "map: expected a map (.npz) that LandmarkMap.save wrote, got a br",
+        ),
+        ("--truth t0.txt --estimate r0.txt --delta 0", "delta: expected an int >= 1"),
+        ("--truth t0.txt --estimate r0.txt --json no/such/file.json", "json: expected"),
     ],
 )
-def test_bad_scores_cost_one_line(options: tuple[str, ...], says: str, vslam: Any, files: Path) -> None:
-    """Missing and foreign files, clocks that differ, numbers of paths."""
-    done = vslam("score", *options)
+def test_bad_scores_cost_one_line(options: str, says: str, vslam: Any, files: Path) -> None:
+    """Missing and foreign files, clocks that differ, numbers of paths; each error begins with the option at fault."""
+    Path("odd.csv").write_text("north,east\n1,2\n")
+    Path("broken.npz").write_bytes(Path("b.npz").read_bytes()[:-9])
+    done = vslam("score", *options.split())
     assert done.status == 2
-    assert says in done.err
+    assert done.err.startswith(f"error {says}")
     assert done.err.count("\n") == 1
 
 
@@ -93,9 +119,10 @@ def test_maps_from_files_are_merged_or_refused_with_the_reason(vslam: Any, files
     assert "Reason: too few candidates" in done.out
     assert Path("none.png").is_file()
     assert not Path("none.npz").exists()
+    saved = "expected a map (.npz) that LandmarkMap.save wrote, got"
     for arguments, says in (
-        (("a.npz", "t0.txt"), "path: expected a file written by LandmarkMap.save"),
-        (("a.npz", "gone.npz"), "got no such file"),
+        (("a.npz", "l.csv"), f"other: {saved} a file of another kind. Check 'l.csv': only .npz is read back."),
+        (("gone.npz", "a.npz"), f"one: {saved} no such file. Check 'gone.npz'."),
         (("a.npz", "b.npz", "--out", "map.txt"), "out: expected a name that ends in .npz, .csv or .ply, got 'map.txt'"),
     ):
         done = vslam("merge", *arguments)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slam_backend.readers.bag_files import open_bag
-from slam_backend.readers.bags import load_bag
+from slam_backend.readers.bags import bag_topics, load_bag
 from training.report.mcap_file import write_mcap
 from training.report.recording import part_of
 from vslam_env.navigation.occupancy_grid import CELL, FREE, OCCUPIED
@@ -80,10 +80,14 @@ def test_occupied_cells_lie_on_walls(episode: Any, tmp_path: Path) -> None:
 
 
 def test_landmarks_of_the_world_are_no_sightings(episode: Any, tmp_path: Path) -> None:
-    """The reader of bags refuses a map in the frame `world`, which is none of the robot."""
+    """The reader of bags refuses a map in the frame `world`, which is none of the robot, and lists none of them."""
     file = write_mcap(episode[2], tmp_path / "episode.mcap")
-    message = "landmarks: expected landmarks of /robot0/map in a frame of the robot, got 'world'"
-    with pytest.raises(ValueError, match=message):
+    listed = bag_topics(file)
+    assert {use for _, _, _, use in listed} == {"", "odometry, truth"}
+    assert {"/landmarks", "/tf", "/robot0/map"} <= {name for name, _, _, use in listed if not use}
+    with pytest.raises(
+        ValueError, match="landmarks: expected landmarks of /robot0/map in a frame of the robot, got 'world'"
+    ):
         load_bag(file, ["/robot0/truth"], ["/robot0/map"])
 
 
@@ -91,5 +95,5 @@ def test_other_names_and_a_missing_package_are_refused_for_ros(refusal: Any, mon
     """Both are refused before a folder is made, with the cure."""
     assert "mcap: expected a name that ends in .mcap, got 'episode.bag'." in refusal("run", "--mcap", "episode.bag")
     assert "mcap: expected a file that can be written" in refusal("run", "--mcap", "none/episode.mcap")
-    monkeypatch.setattr("training.report.mcap_file.find_spec", lambda name: None)
+    monkeypatch.setattr("training.report.recording.find_spec", lambda name: None)
     assert "mcap: expected the package rosbags, got no such package. Install it" in refusal("run", "--mcap", "a.mcap")

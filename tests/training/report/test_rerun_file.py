@@ -35,9 +35,9 @@ def test_a_file_holds_the_episode(episode: Any, tmp_path: Path) -> None:
 
 def test_other_names_and_a_missing_package_are_refused(refusal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both are refused before a folder is made, with the cure."""
-    monkeypatch.setattr("training.report.rerun_file.find_spec", lambda name: None)
+    monkeypatch.setattr("training.report.recording.find_spec", lambda name: None)
     assert "rerun: expected the package rerun-sdk, got no such package. Install it" in refusal(
         "run", "--rerun", "episode.rrd"
     )
-    monkeypatch.setattr("training.report.rerun_file.find_spec", lambda name: object())
+    monkeypatch.setattr("training.report.recording.find_spec", lambda name: object())
     assert "rerun: expected a name that ends in .rrd, got 'episode.mp4'." in refusal("run", "--rerun", "episode.mp4")

@@ -378,7 +378,7 @@ def test_an_imported_map_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"image": "gone.pgm"}, r"world: expected a file, got '.*gone.pgm'. Check the path"),
+        ({"image": "gone.pgm"}, r"world: expected a file, got no such file. Check '.*gone.pgm'"),
         ({"image": "map.yaml"}, "world: expected an image file"),
         ({"image": 3}, "world: expected a path as image"),
         ({"resolution": 0}, r"world: map\.yaml resolution: expected a finite number > 0, got 0"),

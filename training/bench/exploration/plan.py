@@ -13,6 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from slam_backend.core.files import missing_error
 from slam_backend.core.text_files import read_toml
 from slam_backend.core.validation import argument_error, check_choice, choice_error
 from training.bench.exploration.players import environment_of
@@ -109,6 +110,8 @@ class Plan(Checked):
         if not file.is_file():
             file = Path(source)
         if not file.is_file():
+            if file.suffix == ".toml" or len(file.parts) > 1:
+                raise missing_error("plan", "the path of a TOML file", file)
             known = [path.stem for path in sorted(PLANS.glob("*.toml"))]
             raise choice_error("plan", source, known, "Check the spelling.", ", or the path of a TOML file")
         values = read_toml(file, "plan")

@@ -1,6 +1,7 @@
 """Command-line options, generated from the class of a command's configuration."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
@@ -110,6 +111,24 @@ def numbers(name: str, text: str, kind: Callable[[str], Any] = int) -> tuple[Any
         return tuple(kind(word) for word in text.split(","))
     except ValueError as error:
         raise argument_error(name, "comma-separated numbers", repr(text), "Write them like 10,100.") from error
+
+
+@contextmanager
+def naming(**options: str) -> Iterator[None]:
+    """Let errors about an argument within a block name the option that gave it.
+
+    Args:
+        options: The option by name of the argument: `path="truth"`.
+    """
+    from slam_backend.core.validation import is_argument_error
+
+    try:
+        yield
+    except ValueError as error:
+        name, colon, rest = str(error).partition(":")
+        if name not in options or not is_argument_error(error):
+            raise
+        raise ValueError(options[name] + colon + rest) from error
 
 
 def _name(name: str, field: FieldInfo) -> str:

@@ -16,32 +16,34 @@ from training.experiments.output.console import make_console
 def compilation_progress(console: Console) -> Iterator[Callable[[int, int, float], None]]:
     """Show that the compiler runs, from the first compilation in the block on, and its total time afterwards.
 
-    A terminal shows a spinner, other outputs one line. Nothing is shown if all kernels come from the cache. The
-    block must not use a live display of its own.
+    A terminal shows a spinner with the number of kernels compiled, other outputs one line. Nothing is shown if all
+    kernels come from the cache. The block must not use a live display of its own.
 
     Yields:
         Progress callback for `warm_up`.
     """
-    from slam_backend.core.compilation.messages import MESSAGE, watch_compilation
+    from slam_backend.core.compilation.compiler import showing
+    from slam_backend.core.compilation.messages import MESSAGE, message, watch_compilation
 
     spinner = Spinner("dots", MESSAGE)
     begun: list[float] = []
     with ExitStack() as stack:
 
-        def begin(name: str = "") -> None:
+        def begin(name: str = "", total: int = 0) -> None:
             if not begun:
                 begun.append(time.perf_counter())
                 if console.is_terminal:
                     stack.enter_context(Live(spinner, console=console, transient=True))
                 else:
-                    console.print(MESSAGE, highlight=False)
+                    console.print(message(total), highlight=False)
 
         def progress(done: int, total: int, left: float) -> None:
-            begin()
+            begin(total=total)
             time_left = "" if math.isnan(left) else f", about {left:.0f} s left"
             spinner.update(text=f"{MESSAGE} {done} of {total}{time_left}")
 
         stack.enter_context(watch_compilation(begin))
+        stack.enter_context(showing(progress))
         yield progress
         seconds = time.perf_counter() - begun[0] if begun else 0.0
     if begun:

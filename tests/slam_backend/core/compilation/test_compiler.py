@@ -116,20 +116,21 @@ def test_damaged_files_are_missing(tmp_path: Path) -> None:
 
 EXPECTING = """
 from slam_backend.core.compilation.compiler import decode_signature, expect, find_kernel, missing_tasks
-from slam_backend.core.compilation.compiler import recorded_signatures
+from slam_backend.core.compilation.compiler import recorded_signatures, showing
 from slam_backend.core.compilation.messages import watch_compilation
+counts = []
 names = ["slam_backend.geometry._invert_rows", "slam_backend.geometry._compose_rows"]
 needed = {name: recorded_signatures("slam_backend")[name] for name in names}
 expect(lambda: needed)
-with watch_compilation(lambda name: None) as watch:
+with watch_compilation(lambda name: None) as watch, showing(lambda done, total, left: counts.append((done, total))):
     find_kernel(names[0]).compile(decode_signature(needed[names[0]][0]))
-print(len(watch.names), len(missing_tasks(needed)))
+print(len(watch.names), len(missing_tasks(needed)), counts)
 """
 
 
 def test_the_first_kernel_that_is_missing_is_compiled_with_all_that_is_expected(tmp_path: Path) -> None:
-    """Other processes compile both kernels, and this one loads the first; with one core, it compiles what it calls."""
-    for cores, printed in ((2, "0 0"), (1, "1 1")):
+    """Other processes compile both kernels, with their count, and this one loads the first; one core compiles one."""
+    for cores, printed in ((2, "0 0 [(0, 2), (1, 2), (2, 2)]"), (1, "1 1 []")):
         cores_of = f"import os; os.sched_getaffinity = lambda pid: range({cores})"
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / str(cores)), "PYTHONPATH": str(ROOT)}
         command = [sys.executable, "-c", cores_of + EXPECTING]
