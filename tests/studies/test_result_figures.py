@@ -18,7 +18,7 @@ def test_tables_are_read_by_their_first_heading() -> None:
 
 @pytest.mark.parametrize(("draw", "name"), [(draw_loop, "loop"), (draw_beside_gtsam, "beside_gtsam")])
 def test_kept_figures_show_the_tables(draw: object, name: str, tmp_path: Path) -> None:
-    """A figure that is drawn anew hardly differs from the kept one; fonts may."""
+    """A figure that is drawn again hardly differs from the kept one; fonts may."""
     assert callable(draw)
     draw(PAGE.read_text(encoding="utf-8"), tmp_path / "new.png")
     kept = Image.open(ROOT / "docs" / "figures" / f"{name}.png").convert("L")
