@@ -139,6 +139,7 @@ def run_robot(
         robot.share()
         exchange()
         robot.attempt()
+    transport.close()
     parent.send((robot.group, robot.map(min_count=2)))
 
 
