@@ -9,10 +9,13 @@ docs/how-to/robots.md says what else a robot needs.
 """
 
 import multiprocessing
+import signal
 import socket
+import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -36,7 +39,8 @@ from vslam_env.config import TICK
 
 NEAR = 0.5  # largest distance of a landmark that counts as a true one [m]
 SAVE_EVERY = 50  # steps between two saves
-LINGER = 3.0  # time that robots listen to each other at the end [s]
+LINGER = 6.0  # time that robots listen to each other at the end [s]
+MOST_LATE = 2.0  # [s]
 Steps = list[tuple[FloatArray | None, Measurements | None]]
 
 
@@ -81,15 +85,17 @@ def record_mrclam(folder: Path) -> Recorded:
 
 
 def run_robot(
-    name: str, ports: Mapping[str, int], steps: Steps, pace: float, options: Any, folder: Path, ready: Any
+    name: str, ports: Mapping[str, int], steps: Steps, pace: float, options: Any, file: Path, parent: Any
 ) -> None:
-    """Run one robot until its readings end: the process of a robot."""
+    """Run one robot until its readings end and `parent`, a pipe, says so or is gone: the process of a robot."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     transport = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     transport.bind(("127.0.0.1", ports[name]))
     transport.setblocking(False)
     others = [("127.0.0.1", port) for other, port in ports.items() if other != name]
-    file = folder / f"{name}.state"
-    robot = RobotSlam.load(file) if file.exists() else RobotSlam(name, life=time.time_ns(), **options)
+
+    def say(text: str) -> None:
+        print(f"{name}: {text}", flush=True)
 
     def exchange() -> None:
         for message in robot.outbox():
@@ -101,25 +107,48 @@ def run_robot(
             except BlockingIOError:
                 return
             if refusal is not None:
-                print(f"{name}: {refusal}", flush=True)
+                say(refusal)
 
-    (folder / f"{name}.ready").touch()
-    ready.wait()
-    begin = time.monotonic() - pace * robot.filter.next_step
+    if file.exists():
+        robot = RobotSlam.load(file)
+        say(f"back from its file, at step {robot.filter.next_step} of {len(steps)}")
+    else:
+        robot = RobotSlam(name, life=time.time_ns(), **options)
+    parent.send("ready")
+    parent.recv()
+    begin, saves, late = time.monotonic() - pace * robot.filter.next_step, True, 0.0
     for odometry, frame in steps[robot.filter.next_step :]:
         robot.step(odometry, frame)
         exchange()
         if robot.filter.next_step % SAVE_EVERY == 0:
-            robot.save(file)
-        time.sleep(max(0.0, begin + pace * robot.filter.next_step - time.monotonic()))
-    end = time.monotonic() + LINGER
-    while time.monotonic() < end:
+            try:
+                robot.save(file)
+                if not saves:
+                    say("saved again")
+                saves = True
+            except ValueError as error:  # such as a full disk: the earlier file stays
+                if saves:
+                    say(f"not saved, goes on: {error}")
+                saves = False
+        late = time.monotonic() - begin - pace * robot.filter.next_step
+        time.sleep(max(0.0, -late))
+    if late > MOST_LATE:
+        say(f"{late:.0f} s late: this machine needs a smaller --speed")
+    parent.send("at the end")
+    while not parent.poll(0.2):
         robot.share()
         exchange()
         robot.attempt()
-        time.sleep(0.1)
-    robot.map(min_count=2).save(folder / f"{name}.npz")
-    (folder / f"{name}.group").write_text(" ".join(robot.group), encoding="utf-8")
+    transport.close()
+    parent.send((robot.group, robot.map(min_count=2)))
+
+
+def heard(pipe: Any) -> Any:
+    """Return what a process says next; None if it has ended."""
+    try:
+        return pipe.recv()
+    except (EOFError, OSError):
+        return None
 
 
 def free_ports(count: int) -> list[int]:
@@ -148,13 +177,12 @@ def score(landmarks: LandmarkMap, start: FloatArray, truth: FloatArray) -> str:
 
 
 def team_maps(recorded: Recorded) -> list[tuple[tuple[int, ...], LandmarkMap]]:
-    """Return group and map of each robot of a `TeamSlam` that reads the same, each in the start frame of the robot."""
+    """Return each group of a `TeamSlam` that reads the same, and its map, start frame of the first robot."""
     team = TeamSlam(len(recorded.steps), recorded.alignment, attempts=recorded.attempts, **recorded.options)
     for tick in zip(*recorded.steps, strict=True):
         team.step([odometry for odometry, _ in tick], [frame for _, frame in tick])
     team.rejuvenate()
-    group_of = {robot: group for group in team.groups for robot in group}
-    return [(group_of[k], team.map(k, min_count=2).moved(team.start_from_group(k))) for k in range(len(recorded.steps))]
+    return [(group, team.map(group[0], min_count=2)) for group in team.groups]
 
 
 def main(
@@ -170,45 +198,63 @@ def main(
 ) -> None:
     """Run robots as processes, and show their final maps beside those of `TeamSlam` on the same readings."""
     print("Recording ...", flush=True)
-    recorded = record_episode(robots, world, seconds, seed) if mrclam is None else record_mrclam(mrclam)
+    try:
+        recorded = record_episode(robots, world, seconds, seed) if mrclam is None else record_mrclam(mrclam)
+    except ValueError as error:
+        sys.exit(f"error {error}")
     names = [f"robot-{k}" for k in range(len(recorded.steps))]
     if kill is not None and kill >= len(names):
         raise typer.BadParameter(f"expected a number below {len(names)}, got {kill}", param_hint="--kill")
     context = multiprocessing.get_context("spawn")
     options = {**recorded.options, "alignment": recorded.alignment}
-    with tempfile.TemporaryDirectory() as scratch:
-        folder, ports = Path(scratch), dict(zip(names, free_ports(len(names)), strict=True))
-        ready = context.Event()
+    with tempfile.TemporaryDirectory() as folder:
+        ports = dict(zip(names, free_ports(len(names)), strict=True))
 
-        def start(k: int) -> Any:
-            work = (names[k], ports, recorded.steps[k], recorded.seconds / speed, options, folder, ready)
+        def start(k: int) -> tuple[Any, Any]:
+            ours, theirs = context.Pipe()
+            file, pace = Path(folder, f"{names[k]}.state"), recorded.seconds / speed
+            work = names[k], ports, recorded.steps[k], pace, options, file, theirs
             process = context.Process(target=run_robot, args=work, daemon=True)
             process.start()
-            return process
+            theirs.close()
+            return process, ours
 
-        processes = [start(k) for k in range(len(names))]
+        def tell(k: int, text: str) -> None:
+            with suppress(OSError):  # its process has ended
+                running[k][1].send(text)
+
+        running = [start(k) for k in range(len(names))]
+        for _, pipe in running:
+            heard(pipe)
         print(f"{len(names)} processes, {speed:g} times as fast as the robots drove.", flush=True)
-        while len(list(folder.glob("*.ready"))) < len(names):
-            time.sleep(0.1)
-        ready.set()
+        for k in range(len(names)):
+            tell(k, "begin")
         if kill is not None:
             time.sleep(at / speed)
-            processes[kill].kill()
-            processes[kill].join()
-            print(f"Killed {names[kill]} at {at:g} s.", flush=True)
+            running[kill][0].kill()
+            running[kill][0].join()
+            print(f"{names[kill]}: killed at {at:g} s", flush=True)
             if revive:
-                processes[kill] = start(kill)
-        for process in processes:
-            process.join()
-        joint = team_maps(recorded)
-        for k, name in enumerate(names):
-            if not (folder / f"{name}.npz").is_file():
-                print(f"{name}: no map.")
-                continue
-            group = (folder / f"{name}.group").read_text(encoding="utf-8")
-            own = score(LandmarkMap.load(folder / f"{name}.npz"), recorded.starts[k], recorded.landmarks)
-            print(f"{name}, with {group}: {own}.")
-            print(f"  TeamSlam, with {joint[k][0]}: {score(joint[k][1], recorded.starts[k], recorded.landmarks)}.")
+                print(f"{names[kill]}: started again", flush=True)
+                running[kill] = start(kill)
+                heard(running[kill][1])
+                tell(kill, "begin")
+        for _, pipe in running:
+            heard(pipe)
+        time.sleep(LINGER)
+        for k in range(len(names)):
+            tell(k, "end")
+        ends = [heard(pipe) for _, pipe in running]
+    for k, (name, end) in enumerate(zip(names, ends, strict=True)):
+        if end is None:
+            print(f"{name}: its process has ended, no map.")
+            continue
+        group, landmarks = end
+        others = " ".join(other for other in group if other != name)
+        print(f"{name}, with {others or 'nobody'}: {score(landmarks, recorded.starts[k], recorded.landmarks)}.")
+    for robots_of, landmarks in team_maps(recorded):
+        text = " ".join(names[k] for k in robots_of)
+        print(f"TeamSlam, {text}: {score(landmarks, recorded.starts[robots_of[0]], recorded.landmarks)}.")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from std_msgs.msg import Header
-from tf2_ros import Buffer, TransformException, TransformListener
 from visualization_msgs.msg import Marker, MarkerArray
 
 from agents import make_policy
@@ -52,8 +51,11 @@ class ExploreNode(Node):
         self._message: Any = None  # the last map, and its content in the start frame
         self._known: Any = None
         self._goal, self._published = np.full(2, np.nan), 0.0  # start frame; time [s]
-        self._transforms = Buffer()
-        self._listener = TransformListener(self._transforms, self) if self._odom_frame else None
+        if self._odom_frame:
+            from tf2_ros import Buffer, TransformListener  # needed here alone
+
+            self._transforms = Buffer()
+            self._listener = TransformListener(self._transforms, self)
         self._warn = ros.warner(self)
         self._steps = ros.listen(self, self._step, self._warn, wait, sigma, options.camera)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # as maps are published
@@ -84,6 +86,8 @@ class ExploreNode(Node):
         """Return the pose of the odometry's frame in the map, by TF if the parameter odom_frame is given."""
         if not self._odom_frame:
             return np.zeros(3)
+        from tf2_ros import TransformException
+
         try:
             found = self._transforms.lookup_transform(self._map_frame, self._odom_frame, Time()).transform
         except TransformException as error:

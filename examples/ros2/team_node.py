@@ -44,6 +44,7 @@ class TeamNode(Node):
             if self.robot.name != name:
                 hint = "Give each robot a file of its own."
                 raise argument_error("state", f"the file of {name!r}", f"a file of {self.robot.name!r}", hint)
+            self.get_logger().info(f"back from {self._file}, at step {self.robot.filter.next_step}")
         else:
             self.robot = RobotSlam(
                 name, team=team, life=time.time_ns(), seed=seed, share_every=share_every, attempt_every=attempt_every,
@@ -51,7 +52,7 @@ class TeamNode(Node):
             )  # fmt: skip
         self._warn = ros.warner(self)
         self._steps = ros.listen(self, self._step, self._warn, wait, sigma, options.camera)
-        self._resume()
+        self._saved = self._resume()  # line of the odometry that fits the file
         self._maps = self.create_publisher(UInt8MultiArray, SHARED, QUEUE)
         self._group_map = self.create_publisher(PointCloud2, "group_map", 1)
         self._group_poses = self.create_publisher(MarkerArray, "group_poses", 1)
@@ -97,22 +98,25 @@ class TeamNode(Node):
         if self._file is None or self._steps.last is None:
             return
         stamp, pose = self._steps.last
+        line = " ".join(map(repr, (self.robot.filter.next_step, stamp, *pose.tolist())))
+        write_file(self._odometry_file(), f"{self._saved}\n{line}\n")  # whichever state is there if this is the end
         self.robot.save(self._file)
-        numbers = self.robot.filter.next_step, stamp, *pose.tolist()
-        write_file(self._odometry_file(), " ".join(map(repr, numbers)))
+        self._saved = line
 
-    def _resume(self) -> None:
+    def _resume(self) -> str:
         """Continue the odometry at the saved step; without it, the robot must stand where it was then."""
         if self._file is None or not self._odometry_file().is_file():
-            return
-        try:
-            step, stamp, *pose = map(float, self._odometry_file().read_text(encoding="utf-8").split())
-        except ValueError:
-            step, stamp, pose = -1.0, 0.0, []
-        if step == self.robot.filter.next_step and len(pose) == 3 and np.isfinite([stamp, *pose]).all():
-            self._steps.resume(stamp, np.array(pose))
-        else:
-            self._warn(f"{self._odometry_file()}: not of this state; the robot must stand where it was saved")
+            return ""
+        for line in self._odometry_file().read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                step, stamp, *pose = map(float, line.split())
+            except ValueError:
+                continue
+            if step == self.robot.filter.next_step and len(pose) == 3 and np.isfinite([stamp, *pose]).all():
+                self._steps.resume(stamp, np.array(pose))
+                return line
+        self._warn(f"{self._odometry_file()}: not of this state; the robot must stand where it was saved")
+        return ""
 
     def _odometry_file(self) -> Path:
         assert self._file is not None

@@ -81,6 +81,11 @@ class _Joined(NamedTuple):
     starts: dict[str, FloatArray]
     corrections: dict[str, FloatArray]
 
+    def rows(self, name: str, ids: IntArray) -> IntArray:
+        """Return the rows (n,) of landmarks (n,) of a robot's map in the joint graph; -1: it has no such landmark."""
+        row_of = {joint: row for row, joint in enumerate(self.graph.landmark_ids.tolist())}
+        return np.array([row_of.get(self.ids[name].get(own, -1), -1) for own in ids.tolist()], np.int64)
+
 
 def _joined(
     placed: Mapping[str, FloatArray], known: Mapping[str, SharedMap], pairs: Pairs, camera: FloatArray,
@@ -118,13 +123,9 @@ def _joined(
 
 def _placed_map(shared: SharedMap, joint: _Joined, name: str) -> LandmarkMap:
     """Return those landmarks of a robot's map that the joint graph has, where it places them."""
-    landmarks, row_of = shared.landmarks(), {own: row for row, own in enumerate(joint.graph.landmark_ids.tolist())}
-    rows = [row_of.get(joint.ids[name].get(own, -1), -1) for own in landmarks.ids.tolist()]
-    kept = np.array(rows, np.int64) >= 0
-    chosen = landmarks.subset(kept)
-    return unchecked_map(
-        joint.places[np.array(rows, np.int64)[kept]], chosen.covariances, chosen.descriptors, chosen.counts, chosen.ids
-    )
+    rows = joint.rows(name, shared.ids)
+    chosen, places = shared.landmarks().subset(rows >= 0), joint.places[rows[rows >= 0]]
+    return unchecked_map(places, chosen.covariances, chosen.descriptors, chosen.counts, chosen.ids)
 
 
 def _same(one: LandmarkMap, other: LandmarkMap, options: AlignmentOptions) -> IntArray:
@@ -142,17 +143,12 @@ def _placed(name: str, links: Links) -> dict[str, FloatArray]:
 
     These links are a spanning tree: the same for all robots of a group.
     """
-    part = {each: each for pair in links for each in pair}
+    part = {each: {each} for pair in links for each in pair}
     near: dict[str, list[tuple[str, FloatArray]]] = {each: [] for each in part}
-
-    def root(each: str) -> str:
-        while part[each] != each:
-            each = part[each]
-        return each
-
     for (one, other), link in sorted(links.items(), key=lambda item: (-len(item[1].pairs), item[0])):
-        if root(one) != root(other):
-            part[root(one)] = root(other)
+        if other not in part[one]:
+            both = part[one] | part[other]
+            part |= dict.fromkeys(both, both)
             near[one].append((other, link.motion))
             near[other].append((one, inverse(link.motion)))
     placed = {name: np.zeros(3)}
@@ -186,31 +182,27 @@ def _common(
 
 def _landmarks(known: Mapping[str, SharedMap], joint: _Joined) -> tuple[LandmarkMap, IntArray]:
     """Return the landmarks of all maps where the joint graph places them, and the ids of those of the robot itself."""
-    row_of = {own: row for row, own in enumerate(joint.graph.landmark_ids.tolist())}
-    rows: dict[int, tuple[FloatArray, FloatArray, Any, int]] = {}
-    own: list[int] = []
-    for number, (robot, ids) in enumerate(joint.ids.items()):
+    found: dict[int, tuple[FloatArray, Any, int]] = {}  # covariance, descriptor and count, by row of the joint graph
+    for robot in joint.ids:
         landmarks = known[robot].landmarks().moved(joint.corrections[robot])
-        for k, name in enumerate(landmarks.ids.tolist()):
-            shared = ids.get(name)
-            if shared is None or shared not in row_of:
+        for k, row in enumerate(joint.rows(robot, landmarks.ids).tolist()):
+            if row < 0:
                 continue
-            mean, look, count = joint.places[row_of[shared]], landmarks.descriptors[k], int(landmarks.counts[k])
-            if number == 0:
-                own.append(name)
-            if shared in rows:
-                _, covariance, before, counted = rows[shared]
+            look, count = landmarks.descriptors[k], int(landmarks.counts[k])
+            if row in found:
+                covariance, before, counted = found[row]
                 look, count = fuse_descriptors(before, counted, look, count), count + counted
             else:
-                covariance = landmarks.covariances[k] if joint.mode is None else _marginal(joint.mode, row_of[shared])
-            rows[shared] = mean, covariance, look, count
-    means, covariances, looks, counts = zip(*rows.values(), strict=True) if rows else ((),) * 4
-    size = known[next(iter(joint.ids))].descriptors.shape[1]
+                covariance = landmarks.covariances[k] if joint.mode is None else _marginal(joint.mode, row)
+            found[row] = covariance, look, count
+    covariances, looks, counts = zip(*found.values(), strict=True) if found else ((),) * 3
+    rows, own = np.array(list(found), np.int64), known[next(iter(joint.ids))]
     joined = unchecked_map(
-        np.array(means, np.float64).reshape(-1, 3), np.array(covariances, np.float64).reshape(-1, 3, 3),
-        np.array(looks, np.float32).reshape(-1, size), np.array(counts, np.int64), np.array(list(rows), np.int64),
+        joint.places[rows], np.array(covariances, np.float64).reshape(-1, 3, 3),
+        np.array(looks, np.float32).reshape(-1, own.descriptors.shape[1]), np.array(counts, np.int64),
+        joint.graph.landmark_ids[rows],
     )  # fmt: skip
-    return joined, np.array(own, np.int64)
+    return joined, own.ids[joint.rows(own.robot, own.ids) >= 0]
 
 
 def _marginal(mode: MapEstimate, row: int) -> FloatArray:

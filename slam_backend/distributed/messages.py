@@ -19,7 +19,6 @@ from slam_backend.state import (
     FLOAT32,
     FLOAT64,
     INT64,
-    MAX_DESCRIPTOR,
     MAX_DISTANCE,
     MAX_LANDMARKS,
     Array,
@@ -90,9 +89,8 @@ class SharedMap:
     STATE: ClassVar = State(
         robot=Text(), life=Int(), number=Int(), step=Int(),
         pose=Array(FLOAT64, "3", -MAX_DISTANCE, MAX_DISTANCE), pose_covariance=Array(FLOAT64, "3 3"),
-        means=Array(FLOAT32, "n 3", -MAX_DISTANCE, MAX_DISTANCE), covariances=Array(FLOAT64, "n 3 3"),
-        descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR), counts=Array(INT64, "n", 1),
-        ids=Array(INT64, "n", 0, MAX_LANDMARKS), graph=Record(SlamGraph), links=Each(Record(Link)),
+        **LandmarkMap.STATE.parts | {"means": Array(FLOAT32, "n 3", -MAX_DISTANCE, MAX_DISTANCE)},
+        graph=Record(SlamGraph), links=Each(Record(Link)),
     )  # fmt: skip
     robot: str
     life: int
@@ -110,7 +108,7 @@ class SharedMap:
 
     @staticmethod
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
-        """Refuse repeated landmarks, and covariances that are none."""
+        """Refuse repeated landmarks, and covariances and counts that are none."""
         LandmarkMap(*(parts[name] for name in FIELDS))
 
     @classmethod

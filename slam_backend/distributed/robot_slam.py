@@ -18,8 +18,9 @@ from slam_backend.distributed.joint_map import JointMap, joint_map
 from slam_backend.distributed.messages import MOST_NAME, ONE_ROBOT, Inbox, Link, SharedMap, messages_of, read_message
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import PoseEstimate, StepReport
-from slam_backend.geometry import compose, inverse, rotate_covariances
-from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions, align_maps
+from slam_backend.geometry import between, compose, rotate_covariances
+from slam_backend.maps.alignment import align_maps
+from slam_backend.maps.alignment_types import Alignment, AlignmentOptions, is_distinct
 from slam_backend.maps.landmark_map import FIELDS, LandmarkMap, unchecked_map
 from slam_backend.models.measurements import Measurements
 from slam_backend.state import (
@@ -41,6 +42,7 @@ from slam_backend.state.files import read_state, write_state
 
 MAGIC = b"vslam robot state "
 MOST_REFUSALS = 2  # refusals in succession after which a link is undone
+Kind = Literal["linked", "moved", "kept", "refused", "undone"]
 NEVER = (0, 0, 0, 0)  # step of an attempt, own number, life and number of the other
 MOST_LOST = 1 << 20  # numbers of maps that a robot may have published after its state was saved
 
@@ -57,7 +59,7 @@ class LinkEvent(NamedTuple):
 
     step: int
     other: str
-    kind: Literal["linked", "moved", "kept", "refused", "undone"]
+    kind: Kind
     alignment: Alignment
 
 
@@ -207,7 +209,7 @@ class RobotSlam:
         self.events.append(LinkEvent(self.filter.next_step, name, self._judge(other, found), found))
         return self.events[-1]
 
-    def _judge(self, other: SharedMap, found: Alignment) -> Any:
+    def _judge(self, other: SharedMap, found: Alignment) -> Kind:
         """Make, keep, move or undo the link to another robot, and return which."""
         before = self._links.get(other.robot)
         if before is not None and before.life != other.life:
@@ -221,7 +223,7 @@ class RobotSlam:
             self._links[other.robot] = Link(other=other.robot, life=other.life, motion=found.transform, pairs=pairs)
             if before is None:
                 return "linked"
-            return "moved" if _differ(before.motion, found.transform) else "kept"
+            return "moved" if is_distinct(between(before.motion, found.transform)) else "kept"
         if before is None:
             return "refused"
         self._refusals[other.robot] += 1
@@ -331,9 +333,3 @@ class RobotSlam:
 def _key(team: str) -> bytes:
     """Return the key that seals the messages of a team."""
     return hashlib.sha256(check_kind("team", team, str, "Give a word that all robots share.").encode()).digest()
-
-
-def _differ(one: FloatArray, other: FloatArray) -> bool:
-    """Return whether two motions count as different."""
-    x, y, turn = compose(inverse(one), other)
-    return bool(np.hypot(x, y) > DISTINCT_TRANSLATION or abs(turn) > DISTINCT_ROTATION)

@@ -185,3 +185,9 @@ class Alignment:
         """Return a refusal: NaN motion and covariance, no inliers."""
         nan, none = math.nan, np.empty((0, 2), np.int64)
         return cls(False, reason, nan, nan, nan, np.full((3, 3), nan), none, ratio, missed, excess)
+
+
+def is_distinct(motion: FloatArray) -> bool:
+    """Return whether two alignments count as different, given the motion (3,) [m, m, rad] from one to the other."""
+    x, y, turn = motion
+    return bool(np.hypot(x, y) > DISTINCT_TRANSLATION or abs(turn) > DISTINCT_ROTATION)

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from slam_backend.geometry import wrap_angle
-from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, align_maps
+from slam_backend.maps.alignment import align_maps
+from slam_backend.maps.alignment_types import is_distinct
 from studies.merging.map_pairs import IDENTIFIABLE, UNALIGNABLE, MapPair, draw_identifiable, draw_pair, draw_unalignable
 from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, first_seed, option
@@ -108,7 +109,7 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
         bound = pair.bound()
         row |= {
             "error_m": float(np.hypot(error[0], error[1])), "error_rad": abs(float(error[2])),
-            "false": bool(np.hypot(error[0], error[1]) > DISTINCT_TRANSLATION or abs(error[2]) > DISTINCT_ROTATION),
+            "false": is_distinct(error),
             "nees": float(error @ np.linalg.solve(alignment.covariance, error)),
             "bound_m2": float(bound[0, 0] + bound[1, 1]), "bound_rad2": float(bound[2, 2]),
         }  # fmt: skip

@@ -16,8 +16,8 @@ from slam_backend.core.blas import single_threaded_blas
 from slam_backend.core.validation import FloatArray
 from slam_backend.distributed import RobotSlam
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.geometry import between, compose, inverse
-from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION
+from slam_backend.geometry import between
+from slam_backend.maps.alignment_types import is_distinct
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.communication import contact_components
 from studies.bounds.episodes import RecordedEpisode, new_team
@@ -85,8 +85,8 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
     first = {k: group[0] for group in team.groups for k in group}
     joint = [map_error(team.map(k, min_count=2), starts[first[k]], episode) for k in range(count)]
     links = [_is_false(robot, name, motion, starts) for robot in robots for name, motion in _links(robot)]
-    read = sum(24 + len(each.measurements or ()) * 4 * (3 + episode_descriptor(each.measurements))
-               for tick in episode.readings for each in tick)  # fmt: skip
+    read = sum(24 + (0 if each.measurements is None else 4 * (each.measurements.points.size
+               + each.measurements.descriptors.size)) for tick in episode.readings for each in tick)  # fmt: skip
     return {
         "map_error": _mean(own, 0), "team_map_error": _mean(joint, 0), "more": _mean(own, 0) - _mean(joint, 0),
         "alone_map_error": _mean(alone, 0), "recall": _mean(own, 1), "team_recall": _mean(joint, 1),
@@ -97,11 +97,6 @@ def play(config: Config, trial: Trial) -> dict[str, Any]:
         "maps_bytes": sent / count / seconds, "inputs_bytes": read / count / seconds,
         "team_bytes": float(team.bytes_sent.mean()) / seconds,
     }  # fmt: skip
-
-
-def episode_descriptor(frame: Any) -> int:
-    """Return the length of the descriptors of a frame, 0 if there is none."""
-    return 0 if frame is None else frame.descriptors.shape[1]
 
 
 def _mean(errors: list[tuple[float, float]], column: int) -> float:
@@ -167,8 +162,7 @@ def _links(robot: RobotSlam) -> list[tuple[str, FloatArray]]:
 def _is_false(robot: RobotSlam, name: str, motion: FloatArray, starts: FloatArray) -> bool:
     """Return whether a link is off by half a metre or 5 degrees."""
     one, other = (int(each.split()[1]) for each in (robot.name, name))
-    x, y, turn = compose(inverse(between(starts[one], starts[other])), motion)
-    return bool(np.hypot(x, y) > DISTINCT_TRANSLATION or abs(turn) > DISTINCT_ROTATION)
+    return is_distinct(between(between(starts[one], starts[other]), motion))
 
 
 STUDY = Study(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from builders import ros_stub as msg
 from builders.environments import small_env
+from builders.full_disk import files_up_to
 from builders.refusals import refused
 from builders.teams import SimulatedTeam
 
@@ -450,9 +451,32 @@ def test_faults_of_files_do_not_stop_a_robot(stub: Any, tmp_path: Path) -> None:
     (tmp_path / "ada.state.odom").write_text("1 2 nonsense")
     world.parameters = ROBOT | {"name": "ada", "state": str(file)}
     again = scripts.team_node.TeamNode()
-    assert "must stand where it was saved" in again.lines[0]
+    assert again.lines[0].startswith("back from ")
+    assert "must stand where it was saved" in again.lines[1]
     world.parameters = ROBOT | {"name": "bo", "state": str(file)}
     refused(scripts.team_node.TeamNode, "state: expected the file of 'bo', got a file of 'ada'")
+
+
+@pytest.mark.parametrize("room", [0, 1000])
+def test_a_full_disk_costs_neither_state_nor_odometry(stub: Any, tmp_path: Path, room: int) -> None:
+    """Whether there is room for no file or for the first alone, the robot comes back where it was saved before."""
+    (world, scripts), simulation, poses = stub, SimulatedTeam(2, seed=1), [np.zeros(3), np.zeros(3)]
+    world.parameters = ROBOT | {"name": "ada", "ns": "/ada", "state": str(tmp_path / "ada.state")}
+    ada = scripts.team_node.TeamNode()
+    drive_team(world, scripts.conversions, simulation, poses, 4)
+    ada.save()
+    step, (stamp, pose) = ada.robot.filter.next_step, ada._steps.last
+    for _ in range(2):
+        drive_team(world, scripts.conversions, simulation, poses, 4)
+        with files_up_to(room):
+            ada.timers[1]()
+    assert [line.partition(", got")[0] for line in ada.lines] == ["path: expected a file that can be written"]
+    again = scripts.team_node.TeamNode()
+    assert again.lines == [f"back from {tmp_path / 'ada.state'}, at step {step}"]
+    assert again._steps.last[0] == stamp
+    np.testing.assert_array_equal(again._steps.last[1], pose)
+    ada.save()  # after some room was made
+    assert scripts.team_node.TeamNode().lines == [f"back from {tmp_path / 'ada.state'}, at step {step + 8}"]
 
 
 def test_the_merge_service_answers_with_a_motion_or_a_reason(stub: Any, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import resource
 import stat
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from builders.full_disk import files_up_to
 
 from slam_backend.core import files
 from slam_backend.core.files import append_text, check_writable, move_file, write_file
@@ -247,16 +247,10 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
     """The reason is said, nothing is left beside the old content, and appended text is there whole or not at all."""
     path = tmp_path / "file"
     append_text(path, "row 1\n")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
-    try:
-        for write in (write_file, append_text):
-            with pytest.raises(
-                ValueError, match=r"out: expected a file that can be written, .* says: File too large\."
-            ):
-                write(path, "x" * 10_000, "out")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    message = r"out: expected a file that can be written, .* says: File too large\."
+    for write in (write_file, append_text):
+        with files_up_to(5000), pytest.raises(ValueError, match=message):
+            write(path, "x" * 10_000, "out")
     assert path.read_text() == "row 1\n"
     append_text(path, "row 2\n")
     assert path.read_text() == "row 1\nrow 2\n"

@@ -3,16 +3,15 @@
 import errno
 import json
 import os
-import resource
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from builders.full_disk import files_up_to
 
 from training import cli
 from training.episodes.video import VideoWriter
@@ -20,17 +19,6 @@ from training.experiments.trial_store import open_folder, run_trials
 
 SHORT = ("--world", "fig5", "--robots", "1", "--particles", "5", "--max-cycles", "20", "--out", "run")
 FULL = Path("/dev/full")
-
-
-@contextmanager
-def _files_up_to(size: int) -> Iterator[None]:
-    """Limit the size of files, as on a nearly full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +47,7 @@ def test_a_full_disk_gives_a_one_line_error(
 ) -> None:
     """The line gives the file and the reason; earlier files are complete, and no partial file is left."""
     monkeypatch.chdir(tmp_path)
-    with _files_up_to(size):
+    with files_up_to(size):
         said = vslam("run", *SHORT, *options)
     assert said.status == 2
     last = said.err.splitlines()[-1]
@@ -79,7 +67,7 @@ def test_a_video_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
     frames = np.random.default_rng(0).integers(0, 256, (20, 64, 64, 3), dtype=np.uint8)
 
     def film() -> None:
-        with _files_up_to(3_000), VideoWriter(path, (64, 64)) as video:
+        with files_up_to(3_000), VideoWriter(path, (64, 64)) as video:
             for frame in frames:
                 video.add(frame)
 
@@ -95,7 +83,7 @@ def _row(trial: Any) -> dict[str, Any]:
 def test_finished_trials_survive_a_full_disk(tmp_path: Path) -> None:
     """Trials written before the disk was full are kept as complete lines."""
     folder = open_folder(tmp_path / "run", "count", {}, 0)
-    with _files_up_to(1_000), pytest.raises(ValueError, match=r"out: expected a file .* says: File too large\."):
+    with files_up_to(1_000), pytest.raises(ValueError, match=r"out: expected a file .* says: File too large\."):
         run_trials(folder, "trials.jsonl", _row, range(9), 1, lambda: False, lambda row: None)
     rows = [json.loads(line) for line in (folder.path / "trials.jsonl").read_text().splitlines()]
     assert [row["seed"] for row in rows] == [0, 1]
