@@ -251,7 +251,7 @@ def main(
             continue
         group, landmarks = end
         others = " ".join(other for other in group if other != name)
-        print(f"{name}, with {others or 'nobody'}: {score(landmarks, recorded.starts[k], recorded.landmarks)}.")
+        print(f"{name}, with {others or 'no other'}: {score(landmarks, recorded.starts[k], recorded.landmarks)}.")
     for robots_of, landmarks in team_maps(recorded):
         text = " ".join(names[k] for k in robots_of)
         print(f"TeamSlam, {text}: {score(landmarks, recorded.starts[robots_of[0]], recorded.landmarks)}.")

@@ -14,7 +14,7 @@ from training.experiments.output.plotting import picture, save_png
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "reference" / "results.md"
-DARK, LIGHT, ORANGE, GREY = "#1f5a8a", "#a9c9e2", "#d9822b", "0.45"
+DARK, LIGHT, ORANGE = "#1f5a8a", "#a9c9e2", "#d9822b"
 
 
 def read_table(page: str, first_heading: str) -> tuple[list[str], list[tuple[str, list[float]]]]:
@@ -61,24 +61,26 @@ def draw_loop(page: str, file: Path) -> None:
 
 @picture
 def draw_beside_gtsam(page: str, file: Path) -> None:
-    """Draw position errors and times of a step of the filter, iSAM2 and a batch optimiser."""
-    _, rows = read_table(page, "position RMS [m]")
-    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
+    """Draw position errors of the filter over those of iSAM2, for one robot and for teams, and times of a step."""
+    headings, alone = read_table(page, "position RMS [m]")
+    _, teams = read_table(page, "three robots [m]")
+    ratio, own, other = (headings.index(name) - 1 for name in ("filter over iSAM2", "step [ms]", "of iSAM2 [ms]"))
+    figure = Figure(figsize=(8.4, 5.0), layout="constrained")
     errors, times = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-    numbers = [numbers for _, numbers in rows]
-    filter_error, online_error, batch_error, filter_time, online_time = zip(*numbers, strict=True)
-    places = range(len(rows))
-    errors.scatter(batch_error, places, marker="|", s=90, color=GREY, label="batch, in hindsight")
-    errors.scatter(online_error, places, facecolors="none", edgecolors=ORANGE, s=60, label="iSAM2")
-    errors.scatter(filter_error, places, color=DARK, s=22, label="vslam_env")
-    times.scatter(online_time, places, facecolors="none", edgecolors=ORANGE, s=60)
-    times.scatter(filter_time, places, color=DARK, s=22)
-    for ax, title in ((errors, "position RMS [m]"), (times, "step [ms]")):
-        ax.set_xscale("log")
-        ax.set_xlabel(title)
-        ax.grid(alpha=0.2, which="both", axis="x")
-    _name_rows(errors, [label for label, _ in rows])
-    figure.legend(*errors.get_legend_handles_labels(), ncols=3, frameon=False, loc="outside upper center")
+    places = range(len(alone))
+    errors.axvline(1.0, color=ORANGE, lw=1.0)
+    errors.barh(places, [row[ratio] for _, row in alone], color=DARK, label="one robot")
+    below = range(len(alone), len(alone) + len(teams))
+    errors.barh(below, [row[ratio] for _, row in teams], color=LIGHT, label="three robots that merge")
+    errors.set_xlabel("position RMS over that of iSAM2")
+    times.scatter([row[other] for _, row in alone], places, color=ORANGE, s=24, label="iSAM2")
+    times.scatter([row[own] for _, row in alone], places, color=DARK, s=24, label="vslam_env")
+    times.set_xscale("log")
+    times.set_xlabel("step [ms]")
+    times.grid(alpha=0.2, which="both", axis="x")
+    for ax, corner in ((errors, "left"), (times, "right")):
+        figure.legend(*ax.get_legend_handles_labels(), ncols=2, frameon=False, loc=f"outside upper {corner}")
+    _name_rows(errors, [label for label, _ in (*alone, *teams)])
     save_png(figure, file, 110)
 
 
