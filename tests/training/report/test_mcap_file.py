@@ -82,7 +82,9 @@ def test_occupied_cells_lie_on_walls(episode: Any, tmp_path: Path) -> None:
 def test_landmarks_of_the_world_are_no_sightings(episode: Any, tmp_path: Path) -> None:
     """The reader of bags refuses a map in the frame `world`, which is none of the robot."""
     file = write_mcap(episode[2], tmp_path / "episode.mcap")
-    with pytest.raises(ValueError, match="landmarks: expected landmarks of /robot0/map in a frame of the robot, got 'world'"):
+    with pytest.raises(
+        ValueError, match="landmarks: expected landmarks of /robot0/map in a frame of the robot, got 'world'"
+    ):
         load_bag(file, ["/robot0/truth"], ["/robot0/map"])
 
 
