@@ -97,8 +97,12 @@ def run_robot(
     def say(text: str) -> None:
         print(f"{name}: {text}", flush=True)
 
+    sent, saves, late = 0, True, 0.0
+
     def exchange() -> None:
+        nonlocal sent
         for message in robot.outbox():
+            sent += len(message)
             for address in others:
                 transport.sendto(message, address)
         while True:
@@ -109,38 +113,45 @@ def run_robot(
             if refusal is not None:
                 say(refusal)
 
+    def save() -> None:
+        nonlocal saves
+        before, saves = saves, True
+        try:
+            robot.save(file)
+        except ValueError as error:  # such as a full disk: the earlier file stays
+            saves = False
+            if before:
+                say(f"not saved, goes on: {error}")
+        if saves and not before:
+            say("saved again")
+
     if file.exists():
         robot = RobotSlam.load(file)
         say(f"back from its file, at step {robot.filter.next_step} of {len(steps)}")
+        save()  # so that it is heard again, even if it is killed before the next time
     else:
         robot = RobotSlam(name, life=time.time_ns(), **options)
     parent.send("ready")
     parent.recv()
-    begin, saves, late = time.monotonic() - pace * robot.filter.next_step, True, 0.0
-    for odometry, frame in steps[robot.filter.next_step :]:
+    first = robot.filter.next_step
+    begin = time.monotonic() - pace * first
+    for odometry, frame in steps[first:]:
         robot.step(odometry, frame)
         exchange()
         if robot.filter.next_step % SAVE_EVERY == 0:
-            try:
-                robot.save(file)
-                if not saves:
-                    say("saved again")
-                saves = True
-            except ValueError as error:  # such as a full disk: the earlier file stays
-                if saves:
-                    say(f"not saved, goes on: {error}")
-                saves = False
+            save()
         late = time.monotonic() - begin - pace * robot.filter.next_step
         time.sleep(max(0.0, -late))
     if late > MOST_LATE:
         say(f"{late:.0f} s late: this machine needs a smaller --speed")
-    parent.send("at the end")
+    parent.send(sent / max(1, robot.filter.next_step - first))
     while not parent.poll(0.2):
         robot.share()
         exchange()
         robot.attempt()
     transport.close()
-    parent.send((robot.group, robot.map(min_count=2)))
+    with suppress(OSError):  # the parent is gone
+        parent.send((robot.group, robot.map(min_count=2)))
 
 
 def heard(pipe: Any) -> Any:
@@ -239,8 +250,7 @@ def main(
                 running[kill] = start(kill)
                 heard(running[kill][1])
                 tell(kill, "begin")
-        for _, pipe in running:
-            heard(pipe)
+        sent = [heard(pipe) for _, pipe in running]
         time.sleep(LINGER)
         for k in range(len(names)):
             tell(k, "end")
@@ -251,7 +261,9 @@ def main(
             continue
         group, landmarks = end
         others = " ".join(other for other in group if other != name)
-        print(f"{name}, with {others or 'no other'}: {score(landmarks, recorded.starts[k], recorded.landmarks)}.")
+        found = score(landmarks, recorded.starts[k], recorded.landmarks)
+        rate = 1e-3 * sent[k] / recorded.seconds
+        print(f"{name}, with {others or 'nobody'}: {found}, {rate:.1f} kB/s sent.")
     for robots_of, landmarks in team_maps(recorded):
         text = " ".join(names[k] for k in robots_of)
         print(f"TeamSlam, {text}: {score(landmarks, recorded.starts[robots_of[0]], recorded.landmarks)}.")

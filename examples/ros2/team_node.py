@@ -53,6 +53,7 @@ class TeamNode(Node):
         self._warn = ros.warner(self)
         self._steps = ros.listen(self, self._step, self._warn, wait, sigma, options.camera)
         self._saved = self._resume()  # line of the odometry that fits the file
+        ros.guarded(self._warn, self.save)()  # so that it is heard again, even if it is killed before the next time
         self._maps = self.create_publisher(UInt8MultiArray, SHARED, QUEUE)
         self._group_map = self.create_publisher(PointCloud2, "group_map", 1)
         self._group_poses = self.create_publisher(MarkerArray, "group_poses", 1)

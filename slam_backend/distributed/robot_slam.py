@@ -80,7 +80,7 @@ class RobotSlam:
 
     Attributes:
         filter: Filter of this robot.
-        events: Outcomes of all attempts since the robot was built or loaded, in order.
+        events: Outcomes of all attempts since the robot was built or loaded, in order; yours to clear.
         refused: Number of messages refused so far.
         dropped: Number of messages of its own that were replaced by later ones before `outbox` returned them.
 
@@ -181,7 +181,8 @@ class RobotSlam:
         if isinstance(part, str):
             why: str | None = part
         elif part.robot == self.name:
-            why = None if part.life <= self.life else f"expected one robot named {self.name!r}, got two: rename one"
+            is_own = (part.life, part.number) <= (self.life, self._number)  # some transports echo
+            why = None if is_own else f"expected one robot named {self.name!r}, got two: rename one"
         else:
             why = self._inbox.add(part, self.filter.descriptor_size)
         self.refused += why is not None
@@ -312,8 +313,8 @@ class RobotSlam:
     def load(cls, path: str | Path, team: str = "team") -> Self:
         """Return the robot of a file, with the maps it had received; reading the file runs none of its content.
 
-        Its next map counts as newer than those it published after the file was written. What it drove since then is
-        the caller's to tell: the next odometry.
+        Its next map counts as newer than those it published after the file was written; save at once, so that this
+        holds the next time, too. What it drove since then is the caller's to tell: the next odometry.
 
         Args:
             path: File that `save` wrote.

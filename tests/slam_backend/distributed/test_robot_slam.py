@@ -162,6 +162,13 @@ def test_a_robot_of_a_file_is_heard_again(met: Any, tmp_path: Path) -> None:
     back.share()
     assert all(robots[0].receive(message) is None for message in back.outbox())
     assert robots[0]._inbox.maps["bo"].number > number
+    number = robots[0]._inbox.maps["bo"].number
+    back = RobotSlam.load(tmp_path / "bo")
+    back.save(tmp_path / "bo")  # at once, and is killed before the next time
+    again = RobotSlam.load(tmp_path / "bo")
+    again.share()
+    assert all(robots[0].receive(message) is None for message in again.outbox())
+    assert robots[0]._inbox.maps["bo"].number > number
 
 
 def test_a_robot_with_an_empty_memory_replaces_its_former_self(met: Any) -> None:
@@ -183,10 +190,11 @@ def test_a_robot_with_an_empty_memory_replaces_its_former_self(met: Any) -> None
     assert robots[0]._inbox.maps["bo"].life == 1
 
 
-def test_two_robots_of_one_name_are_noticed(met: Any) -> None:
-    """A robot that hears its own name in a later life says so."""
+@pytest.mark.parametrize("life", [0, 7])
+def test_two_robots_of_one_name_are_noticed(met: Any, life: int) -> None:
+    """A robot that hears its own name in a later life, or with a map that it has not published, says so."""
     simulation = SimulatedTeam(1, seed=5)
-    robot, other = robots_of(simulation)[0], robots_of(simulation, life=7)[0]
+    robot, other = robots_of(simulation)[0], robots_of(simulation, life=life)[0]
     drive(simulation, [other], 20)
     other.share()
     assert robot.receive(other.outbox()[0]) == "expected one robot named 'ada', got two: rename one"
