@@ -4,10 +4,12 @@ Made are the pages of the repository's root, of notebooks, of commands and of pu
 section from the home page, `docs/README.md`. Pages outside of the menu belong to the section of their folder.
 """
 
+import ast
 import json
 import os
 import posixpath
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 ROOT_PAGES = ("CONTRIBUTING.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md")
 REPOSITORY = os.environ.get("GITHUB_REPOSITORY", "")  # ACCOUNT/NAME, in workflows of GitHub
+LEADERBOARD = "reference/leaderboard.md"  # its tables have every word of the metrics
 NOTEBOOKS = DOCS / "notebooks"
 SECTION = re.compile(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 MODULE = re.compile(r"^\| `([\w.]+)` \|", re.MULTILINE)
@@ -83,6 +86,20 @@ def module_page(module: str) -> str:
     return f"reference/api/{module}.md"
 
 
+@cache
+def public_names() -> dict[str, str]:
+    """Return the place on the site of each name in `__all__` of a public module, the first one that has it."""
+    places: dict[str, str] = {}
+    for module in public_modules():
+        path = ROOT.joinpath(*module.split("."))
+        file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        for statement in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "__all__":
+                for name in ast.literal_eval(statement.value):
+                    places.setdefault(name, f"{module_page(module)}#{module}.{name}")
+    return places
+
+
 def notebooks() -> list[Path]:
     """Return the notebooks, as `make notebooks` writes them."""
     return sorted(NOTEBOOKS.glob("*.ipynb"))
@@ -119,14 +136,17 @@ def on_nav(nav: Any, config: Any, files: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Let links to files outside of `docs` lead to the pages of the root, or to the repository, or show the name."""
+    """Let links to files outside of `docs` lead to the pages of the root, or to the repository, or show the name.
+
+    A link of a public name to the page of the interface leads to that name.
+    """
     source = page.file.src_uri
     here = posixpath.dirname(source) or "."
     folder = "" if source in ROOT_PAGES else posixpath.dirname(f"docs/{source}")
     page.meta["tags"] = config.extra["keywords"].get(source, [])
     if page.is_homepage:
         page.meta["hide"] = ["navigation", "toc"]
-    if source.startswith("lab/"):
+    if source.startswith("lab/") or source == LEADERBOARD:
         page.meta["search"] = {"boost": 0.1}
 
     def site_link(link: re.Match[str]) -> str:
@@ -135,6 +155,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         if not path:
             return link[0]
         place = posixpath.normpath(posixpath.join(folder, path))
+        if place == "docs/reference/api.md" and (name := public_names().get(text.strip("`"))):
+            return f"[{text}]({posixpath.relpath(name, here)})"
         inside = place if place in ROOT_PAGES else place.removeprefix("docs/").replace(".ipynb", ".md")
         if files.get_file_from_path(inside) is not None and (place in ROOT_PAGES or place.startswith("docs/")):
             return f"[{text}]({posixpath.relpath(inside, here)}{mark}{anchor})"

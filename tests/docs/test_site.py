@@ -135,6 +135,8 @@ def test_the_page_of_commands_has_all_options(hooks: Any) -> None:
 
 @pytest.mark.parametrize(("source", "before", "after"), [
     ("how-to/robots.md", "[add](../../CONTRIBUTING.md#a-world-family)", "[add](../CONTRIBUTING.md#a-world-family)"),
+    ("lab/code.md", "[`nees`](../reference/api.md)", "[`nees`](../reference/api/slam_backend.metrics.md#slam_backend.metrics.nees)"),
+    ("how-to/bags.md", "[interface](../reference/api.md)", "[interface](../reference/api.md)"),
     ("tutorials/own_log.md", "[example](../../examples/own_log.py)", "example (`examples/own_log.py`)"),
     ("tutorials/own_log.md", "[`examples/own_log.py`](../../examples/own_log.py)", "`examples/own_log.py`"),
     ("README.md", "[lab](lab/README.md)", "[lab](lab/README.md)"),
@@ -145,7 +147,8 @@ def test_the_page_of_commands_has_all_options(hooks: Any) -> None:
 ])  # fmt: skip
 def test_links_lead_to_pages_of_the_site(source: str, before: str, after: str, hooks: Any) -> None:
     """Links to pages are relative to the page; other files of the repository are named."""
-    known = {*hooks.ROOT_PAGES, "architecture.md", "lab/README.md", "figures/exploration.png", "notebooks/one.md"}
+    pages = {"architecture.md", "lab/README.md", "notebooks/one.md", "reference/api.md", "figures/exploration.png"}
+    known = pages.union(hooks.ROOT_PAGES)
     assert rendered(hooks, source, before, known) == after
 
 
