@@ -263,7 +263,7 @@ def main(
         others = " ".join(other for other in group if other != name)
         found = score(landmarks, recorded.starts[k], recorded.landmarks)
         rate = 1e-3 * sent[k] / recorded.seconds
-        print(f"{name}, with {others or 'nobody'}: {found}, {rate:.1f} kB/s sent.")
+        print(f"{name}, with {others or 'no other'}: {found}, {rate:.1f} kB/s sent.")
     for robots_of, landmarks in team_maps(recorded):
         text = " ".join(names[k] for k in robots_of)
         print(f"TeamSlam, {text}: {score(landmarks, recorded.starts[robots_of[0]], recorded.landmarks)}.")
