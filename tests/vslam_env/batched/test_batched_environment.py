@@ -31,6 +31,7 @@ def drawn_actions(seed: int, env: Any = ENV) -> Any:
     }
 
 
+@pytest.mark.nightly
 def test_episodes_follow_each_other_and_repeat() -> None:
     """Dones come after the last step, with the reward of it and the first state of the next episode; bits repeat."""
     for _ in range(2):

@@ -122,6 +122,7 @@ def test_merged_robots_share_one_map_and_go_on() -> None:
     assert np.hypot(*errors.T).max() < 0.15
 
 
+@pytest.mark.nightly
 def test_merged_robots_know_how_well_they_know_each_other() -> None:
     """NEES of the pose of one robot as the other sees it is chi-square over 30 teams: nothing is counted twice."""
     drives = [drive(200 + seed, num_robots=2) for seed in range(30)]
