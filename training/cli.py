@@ -37,7 +37,7 @@ COMMANDS = {
         "Train one driver for all robots by PPO, with many environments stepped at once; for accelerators.",
     ),
     "evaluate": (
-        "evaluate", "evaluate",
+        "train", "evaluate",
         "Compare a model with baseline policies on the same unseen worlds, with confidence intervals.",
     ),
     "record": (

@@ -1,4 +1,4 @@
-"""Command `vslam train`: training of one goal-selection network by PPO or imitation; curves, checkpoints, model."""
+"""Commands `vslam train`, of one goal-selection network by PPO or imitation, and `vslam evaluate`, on unseen worlds."""
 
 import os
 from collections.abc import Sequence
@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from training.commands.helpers.options import options
+from training.commands.helpers.options import Workers, options
 from training.commands.helpers.progress import training_bar
 from training.commands.helpers.run_folder import Call
+from training.commands.study import run_study
 from training.experiments.output.compilation import prepare
-from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
+from training.rl.config import SPLIT_TRAIN, EvaluateConfig, TrainConfig, require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.rl.imitation import Imitation
@@ -104,6 +105,19 @@ def train(
         raise
     finally:
         training.close()
+
+
+@options(EvaluateConfig, "evaluate", continues=True)
+def evaluate(call: Call[EvaluateConfig], workers: Workers = 1) -> None:
+    """Compare a model with baseline policies on the same unseen worlds, with confidence intervals.
+
+    All policies have the same worlds, starts and noise, and the same decision interval.
+    Ctrl-C finishes the current episode; the same command with --out FOLDER
+    resumes the evaluation.
+    """
+    from training.rl.evaluation import STUDY
+
+    run_study(call, STUDY, workers)
 
 
 def default_workers(config: TrainConfig) -> int:

@@ -16,19 +16,7 @@ HERE = Path(__file__).parent
 @pytest.mark.parametrize("chosen", ["not nightly", pytest.param("nightly", marks=pytest.mark.nightly)])
 def test_the_tests_with_jax_pass_in_a_process_of_their_own(chosen: str) -> None:
     """The tests of the folder run there, those that compile for long in the night, and none is skipped."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:xdist",
-        "-m",
-        chosen,
-        str(HERE),
-    ]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", chosen]
     flags = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}  # compiling takes most of the time
     environment = os.environ | {"VSLAM_TESTS_WITH_JAX": "1"} | flags
     tests = [str(HERE), "--ignore", str(Path(__file__))]
