@@ -135,7 +135,8 @@ def test_the_page_of_commands_has_all_options(hooks: Any) -> None:
 
 @pytest.mark.parametrize(("source", "before", "after"), [
     ("how-to/robots.md", "[add](../../CONTRIBUTING.md#a-world-family)", "[add](../CONTRIBUTING.md#a-world-family)"),
-    ("lab/code.md", "[`nees`](../reference/api.md)", "[`nees`](../reference/api/slam_backend.metrics.md#slam_backend.metrics.nees)"),
+    ("lab/code.md", "[`nees`](../reference/api.md)",
+     "[`nees`](../reference/api/slam_backend.metrics.md#slam_backend.metrics.nees)"),
     ("how-to/bags.md", "[interface](../reference/api.md)", "[interface](../reference/api.md)"),
     ("tutorials/own_log.md", "[example](../../examples/own_log.py)", "example (`examples/own_log.py`)"),
     ("tutorials/own_log.md", "[`examples/own_log.py`](../../examples/own_log.py)", "`examples/own_log.py`"),
