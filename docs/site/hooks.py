@@ -22,6 +22,8 @@ NOTEBOOKS = DOCS / "notebooks"
 SECTION = re.compile(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 MODULE = re.compile(r"^\| `([\w.]+)` \|", re.MULTILINE)
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:]+)\)")
+LONG_NAME = re.compile(r"<code>([\w.:/]{33,})</code>")
+PART_END = re.compile("::|[._/]")
 PAGE_NAME = re.compile(r"(?:<code>)?(docs/[\w/-]+\.md)(?:</code>)?")
 
 
@@ -170,12 +172,13 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 
 def on_page_context(context: Any, page: Any, config: Any, nav: Any) -> Any:
-    """Let names of pages, as in docstrings, be links."""
+    """Let names of pages, as in docstrings, be links, and let long names break between their parts."""
     pages = {f"docs/{file.src_uri}": file for file in context["pages"]}
 
     def page_link(name: re.Match[str]) -> str:
         file = pages.get(name[1])
         return f'<a href="{file.url_relative_to(page.file)}">{file.page.title}</a>' if file else name[0]
 
-    page.content = PAGE_NAME.sub(page_link, page.content)
+    content = PAGE_NAME.sub(page_link, page.content)
+    page.content = LONG_NAME.sub(lambda name: "<code>" + PART_END.sub(r"\g<0><wbr>", name[1]) + "</code>", content)
     return context
