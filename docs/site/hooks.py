@@ -120,7 +120,7 @@ def notebook_page(notebook: Any, name: str) -> str:
                 parts.append(f"![Output of the cell above](data:image/png;base64,{picture.strip()})")
             else:
                 parts.append(f"```text\n{''.join(output['text'])}```")
-    how = f'*A notebook: read it here, or <a href="{name}" download>open it in Jupyter</a>'
+    how = f'*A notebook: read it here, or <a href="{name}" download>download it for Jupyter</a>'
     if REPOSITORY:
         colab = f"https://colab.research.google.com/github/{REPOSITORY}/blob/main/docs/notebooks/{name}"
         how += f" or [in Colab]({colab})"
