@@ -78,8 +78,8 @@ def draw_beside_gtsam(page: str, file: Path) -> None:
     times.set_xscale("log")
     times.set_xlabel("step [ms]")
     times.grid(alpha=0.2, which="both", axis="x")
-    for ax, corner in ((errors, "left"), (times, "right")):
-        figure.legend(*ax.get_legend_handles_labels(), ncols=2, frameon=False, loc=f"outside upper {corner}")
+    figure.legend(*errors.get_legend_handles_labels(), ncols=2, frameon=False, loc="outside upper left")
+    figure.legend(*times.get_legend_handles_labels(), ncols=2, frameon=False, loc="outside upper right")
     _name_rows(errors, [label for label, _ in (*alone, *teams)])
     save_png(figure, file, 110)
 
