@@ -15,6 +15,7 @@ SMALL = Config(
 )  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_trials_have_errors_of_the_same_size() -> None:
     """Poses stay near the truth for a few seconds, recall is that of the environment, and returns are finite."""
     rows = [asdict(trial) | play(SMALL, trial) for trial in trials(SMALL)]

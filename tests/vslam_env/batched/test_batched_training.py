@@ -74,6 +74,7 @@ def speed(weights: Any) -> float:
     return float(outputs(weights, nothing)[0, 0])
 
 
+@pytest.mark.nightly
 def test_a_driver_learns_the_rewarded_speed_and_its_training_continues(tmp_path: Path) -> None:
     """Returns rise to the optimum but for the noise of the actions; a checkpoint restores weights and rows."""
     training = trained(tmp_path, CONFIG.updates)
