@@ -162,9 +162,9 @@ def test_missing_poses_are_reported(room: Path, tmp_path: Path) -> None:
     [
         (("--left", "left_img_0.png"), "path: expected two or more pairs of images, got a folder with 1 "),
         (("--right", "none*.png"), "It does not exist: name yours with --right."),
-        (("--calibration", "none.yaml,none.yaml"), "calibration: expected a file of a calibration, got '"),
+        (("--calibration", "none.yaml,none.yaml"), "calibration: expected a file of a calibration, got no such file"),
         (("--calibration", "a,b,c"), "calibration: expected one file or two, got 'a,b,c'"),
-        (("--truth", "none.txt"), "truth: expected a file of true poses, got '"),
+        (("--truth", "none.txt"), "truth: expected a file of true poses, got no such file"),
         (("--times", "times.txt"), "times: expected a drive of three pairs or more, got a folder with two pairs"),
     ],
 )
