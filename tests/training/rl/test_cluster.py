@@ -55,6 +55,7 @@ def _assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
         np.testing.assert_array_equal(ours[name], theirs[name])
 
 
+@pytest.mark.slow
 @pytest.mark.nightly
 def test_weights_do_not_depend_on_the_cluster(cluster: Any, tmp_path: Path) -> None:
     """PPO and imitation give the same weights as here, also if a node is lost and another cluster resumes."""
