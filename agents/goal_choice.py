@@ -37,7 +37,7 @@ class Planner(Protocol):
         """Return the slot of the candidate to go to, or None to stay."""
 
 
-class Holder:
+class GoalHolder:
     """Planner that remembers the slot that it chose last."""
 
     def __init__(self) -> None:

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from agents.goal_choice import Holder
+from agents.goal_choice import GoalHolder
 from agents.planners.common.targets import Targets, own_targets, team_targets
 from agents.policy import Policy
 from slam_backend.core.validation import IntArray
@@ -36,7 +36,7 @@ class TeamPolicy(Protocol):
         """
 
 
-class Assigned(Holder):
+class Assigned(GoalHolder):
     """Planner of one robot that solves the assignment for its group on its own belief, and takes its own part.
 
     Args:

@@ -9,7 +9,7 @@ the path to that of now. Robots leave frontiers to which a teammate is nearer.
 
 import numpy as np
 
-from agents.goal_choice import Holder
+from agents.goal_choice import GoalHolder
 from agents.planners.common.predicted_pose import best_of_nearest, d_optimality, predict_covariances
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief
@@ -18,7 +18,7 @@ LEAST = 1e-3  # D-optimality below which the pose counts as known: .02 m and .00
 REACH = 3.0  # [m] added to the length of a path
 
 
-class DOptimality(Holder):
+class DOptimality(GoalHolder):
     """Planner that chooses the frontier with the most unknown area for path length and uncertainty of the pose."""
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:

@@ -6,12 +6,12 @@ with `NearestFrontier` it shows what coordination is worth.
 
 import numpy as np
 
-from agents.goal_choice import Holder, nearest_slot
+from agents.goal_choice import GoalHolder, nearest_slot
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
 
 
-class IndependentFrontier(Holder):
+class IndependentFrontier(GoalHolder):
     """Planner that chooses the nearest frontier, and none where all is explored."""
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:

@@ -6,7 +6,7 @@ Yamauchi, "Frontier-based exploration using multiple robots", Agents 1998, with 
 
 import numpy as np
 
-from agents.goal_choice import Holder, nearest_slot, own_share
+from agents.goal_choice import GoalHolder, nearest_slot, own_share
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
 
@@ -24,7 +24,7 @@ def choose_slot(belief: Belief, held: int | None = None) -> int | None:
     return nearest_slot(candidates, own_share(belief, candidates.of_kind(CandidateKind.FRONTIER)), held)
 
 
-class NearestFrontier(Holder):
+class NearestFrontier(GoalHolder):
     """Planner that chooses the nearest frontier to which no teammate is nearer, and none where all is explored."""
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:

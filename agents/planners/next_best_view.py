@@ -20,7 +20,7 @@ walls beside the path have their looks without a stop.
 
 import numpy as np
 
-from agents.goal_choice import Holder
+from agents.goal_choice import GoalHolder
 from agents.planners.common.targets import own_targets
 from agents.planners.distance_advantage import advantage_costs
 from slam_backend.core.validation import BoolArray, FloatArray
@@ -34,7 +34,7 @@ PATH_SPREAD = 2.0  # [m] by which one frontier must cost more than another to be
 VIEW_SHARPNESS = 4.0  # power of the rates of views that gives preferences
 
 
-class NextBestView(Holder):
+class NextBestView(GoalHolder):
     """Planner that explores, looks again and meets, in this order, within the time that is left."""
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from agents.goal_choice import Holder
+from agents.goal_choice import GoalHolder
 from agents.planners.common.predicted_pose import best_of_nearest, predict_covariances
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief
@@ -22,7 +22,7 @@ MAP_WEIGHT = 0.02  # cells of a grid are not independent: weight of their entrop
 COST = 0.5  # [nats/m] of path
 
 
-class RbpfGain(Holder):
+class RbpfGain(GoalHolder):
     """Planner that chooses the frontier with the largest expected information gain minus cost."""
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:

@@ -8,7 +8,7 @@ since maps are compared without contact of robots, and between visits the robot 
 
 import numpy as np
 
-from agents.goal_choice import Holder, nearest_slot, own_share
+from agents.goal_choice import GoalHolder, nearest_slot, own_share
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
 
@@ -17,7 +17,7 @@ DETOUR = 15.0  # [m] longest path to a rendezvous while there are frontiers
 VISITED = 1.0  # [m]
 
 
-class Rendezvous(Holder):
+class Rendezvous(GoalHolder):
     """Planner that alternates between the nearest frontier and visits of the nearest rendezvous."""
 
     def reset(self) -> None:
