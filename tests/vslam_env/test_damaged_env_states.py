@@ -201,6 +201,7 @@ def test_random_environments_run() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("first", range(1000, 1075, 25))
 def test_many_random_environments_run(first: int) -> None:
     """The same holds of more, of which some twenty-five can be refused more often than played."""

@@ -13,6 +13,7 @@ import pytest
 
 from studies.environment.scale import STUDY, Config, Trial, environment, play, sharing_pairs, trials
 from training.bench.exploration.trials import CURVE_POINTS
+from training.commands.study import run_program
 from training.episodes.guard import PolicyError
 
 PROGRAM = [
@@ -85,12 +86,15 @@ def test_a_run_is_reported_and_resumed(tmp_path: Path) -> None:
     ("--extents 300", "extent: expected a finite number > 0 and <= 200, got 300"),
     ("--extents 0", "extents: expected a finite number > 0"), ("--family maze", "family: expected one of 'rooms'"),
 ])  # fmt: skip
-def test_bad_options_are_refused_before_a_folder_is_made(options: str, said: str, tmp_path: Path) -> None:
+def test_bad_options_are_refused_before_a_folder_is_made(
+    options: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """One line names the option."""
     out = tmp_path / "run"
-    done = subprocess.run([*PROGRAM, *options.split(), "--out", str(out)], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert said in done.stderr
+    monkeypatch.setattr(sys, "argv", [*PROGRAM[2:], *options.split(), "--out", str(out)])
+    with pytest.raises(SystemExit, match="2"):
+        run_program(STUDY)
+    assert said in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -89,7 +89,9 @@ def test_a_wall_is_marked_without_holes(distance: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "fan"), [(1, ANGLES), (2, np.linspace(-1.5, 1.5, 40)), (3, np.array([-0.3, 0.4]))])
+@pytest.mark.parametrize(("seed", "fan"), [
+    (1, ANGLES), pytest.param(2, np.linspace(-1.5, 1.5, 40), marks=pytest.mark.nightly), (3, np.array([-0.3, 0.4])),
+])  # fmt: skip
 def test_a_scan_update_agrees_with_the_plain_definition(seed: int, fan: np.ndarray) -> None:
     """Scans of walls, gaps and nothing, wherever the robot stands and looks, change the evidence as the plain form."""
     rng = np.random.default_rng(seed)
