@@ -15,7 +15,10 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
-ROOT_PAGES = ("CONTRIBUTING.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md")
+ROOT_PAGES = {  # place on the site by file
+    "README.md": "overview.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md",
+    "CODE_OF_CONDUCT.md": "CODE_OF_CONDUCT.md",
+}  # fmt: skip
 REPOSITORY = os.environ.get("GITHUB_REPOSITORY", "")  # ACCOUNT/NAME, in workflows of GitHub
 LEADERBOARD = "reference/leaderboard.md"  # its tables have every word of the metrics
 NOTEBOOKS = DOCS / "notebooks"
@@ -39,8 +42,8 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the pages that are made from other files."""
     from mkdocs.structure.files import File
 
-    for name in ROOT_PAGES:
-        files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    for name, page in ROOT_PAGES.items():
+        files.append(File.generated(config, page, abs_src_path=str(ROOT / name)))
     for page, content in made_pages().items():
         files.append(File.generated(config, page, content=content))
     return files
@@ -144,7 +147,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """
     source = page.file.src_uri
     here = posixpath.dirname(source) or "."
-    folder = "" if source in ROOT_PAGES else posixpath.dirname(f"docs/{source}")
+    folder = "" if source in ROOT_PAGES.values() else posixpath.dirname(f"docs/{source}")
     page.meta["tags"] = config.extra["keywords"].get(source, [])
     if page.is_homepage:
         page.meta["hide"] = ["navigation", "toc"]
@@ -159,7 +162,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         place = posixpath.normpath(posixpath.join(folder, path))
         if place == "docs/reference/api.md" and (name := public_names().get(text.strip("`"))):
             return f"[{text}]({posixpath.relpath(name, here)})"
-        inside = place if place in ROOT_PAGES else place.removeprefix("docs/").replace(".ipynb", ".md")
+        inside = ROOT_PAGES.get(place, place.removeprefix("docs/").replace(".ipynb", ".md"))
         if files.get_file_from_path(inside) is not None and (place in ROOT_PAGES or place.startswith("docs/")):
             return f"[{text}]({posixpath.relpath(inside, here)}{mark}{anchor})"
         if REPOSITORY:
