@@ -251,6 +251,15 @@ def test_a_plan_is_resumed_and_tabulated(vslam: Any, run: Path, tiny: Path) -> N
     assert {row["digest"] for row in table} == {row["digest"] for row in first}
 
 
+def test_tracks_without_rows_are_named(run: Path, tiny: Path) -> None:
+    """A table that is not there was not forgotten."""
+    plan, rows = Plan.load(str(tiny)), _rows(run)
+    others = ", ".join(name for name in plan.all_tracks if name != "standard")
+    only = [row for row in rows if row["track"] == "standard"]
+    assert f"There are no rows of the tracks {others}." in markdown(plan, only, ())
+    assert "There are no rows of the tracks" not in markdown(plan, rows, ())
+
+
 @pytest.mark.slow
 def test_tracks_and_parts_of_a_plan_are_chosen(vslam: Any, tiny: Path, tmp_path: Path) -> None:
     """Tracks by name, the base part alone, and wrong names and combinations in one line."""
