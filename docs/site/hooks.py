@@ -25,6 +25,10 @@ NOTEBOOKS = DOCS / "notebooks"
 SECTION = re.compile(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 MODULE = re.compile(r"^\| `([\w.]+)` \|", re.MULTILINE)
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:]+)\)")
+HIDDEN = re.compile(r"^#+ `vslam [^`]+`\n\n\*\*Usage\*\*.*?(?=^#|\Z)", re.MULTILINE | re.DOTALL)
+SAID = re.compile(r"^#+ `(vslam [^`]+)`\n\n(.+?)\n\n", re.MULTILINE | re.DOTALL)
+GROUP = re.compile(r"^\$ (vslam[\w -]*?) \[OPTIONS\] COMMAND.*?(?=^#|\Z)", re.MULTILINE | re.DOTALL)
+SUMMARY = re.compile(r"^\* `([a-z][\w-]*)`: .*$", re.MULTILINE)
 LONG_NAME = re.compile(r"<code>([\w.:/]{33,})</code>")
 PART_END = re.compile("::|[._/]")
 PAGE_NAME = re.compile(r"(?:<code>)?(docs/[\w/-]+\.md)(?:</code>)?")
@@ -61,14 +65,24 @@ def made_pages() -> dict[str, str]:
 
 
 def commands_page() -> str:
-    """Return the page of all commands with their options and defaults."""
+    """Return the page of all commands with their options and defaults, without those that say nothing of themselves.
+
+    Lists of commands have whole first paragraphs, of which typer leaves 45 letters.
+    """
     import typer
     from typer.cli import get_docs_for_click
 
     from training.cli import app
 
     command = typer.main.get_command(app)
-    return get_docs_for_click(obj=command, ctx=typer.Context(command, info_name="vslam"), name="vslam")
+    text = get_docs_for_click(obj=command, ctx=typer.Context(command, info_name="vslam"), name="vslam")
+    text = HIDDEN.sub("", text)
+    summaries = {name: " ".join(said.split()) for name, said in SAID.findall(text)}
+
+    def with_summaries(group: re.Match[str]) -> str:
+        return SUMMARY.sub(lambda line: f"* `{line[1]}`: {summaries[f'{group[1]} {line[1]}']}", group[0])
+
+    return GROUP.sub(with_summaries, text)
 
 
 def section_pages() -> dict[str, str]:
