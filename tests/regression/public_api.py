@@ -24,11 +24,11 @@ PACKAGES = (
     "agents",
 )  # fmt: skip
 MODULES = (
-    "slam_backend.trajectory", "slam_backend.pose_graph", "slam_backend.fastslam.existence",
+    "slam_backend.geometry", "slam_backend.trajectory", "slam_backend.pose_graph", "slam_backend.fastslam.existence",
     "slam_backend.readers.calibration", "slam_backend.readers.kitti", "slam_backend.readers.mrclam",
     "slam_backend.readers.pose_graphs", "slam_backend.readers.victoria",
     "vslam_env.vslam_v0", "vslam_env.vslam_v1", "vslam_env.reward", "vslam_env.solo", "vslam_env.wrappers",
-    "training.vec_env",
+    "training.replay.log", "training.vec_env",
 )  # fmt: skip
 OWN = re.compile(r"\b(?:slam_backend|vslam_env|agents|training)(?:\.\w+)*\.(\w+)")
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
