@@ -65,20 +65,20 @@ class MergeProcess:
 
     | phase | what happens in it | what ends it | next phase |
     |---|---|---|---|
-    | attempt | The maps of the pair with the most new candidate matches are aligned. | an alignment | smoothing; trial without smoothers |
+    | attempt | The maps of the pair with the most new candidates are aligned. | an alignment | smoothing; trial without smoothers |
     | | | a refusal | refused |
-    | smoothing | Both filters smooth, some work in each step. | both are smooth or 40 steps have passed, and they are in contact | trial, in the next step |
-    | | | a filter is replaced, or there is no contact after 40 steps | abandoned |
-    | trial | Smoothed maps are aligned again; the joint graph of both groups, or particles, tell how uncertain the motion is. | motion known well enough, or waiting does not help | watched; final if merges are not monitored |
+    | smoothing | Both filters smooth, some work in each step. | both are smooth or 40 steps have passed, in contact | trial, in the next step |
+    | | | a filter is replaced, or no contact after 40 steps | abandoned |
+    | trial | Smoothed maps are aligned again; the joint graph, or particles, tell how uncertain the motion is. | motion known well enough, or waiting does not help | watched; final if merges are not monitored |
     | | | a refusal | refused |
-    | watched | The filters are one. Steps with robots of both sides in contact count; each 20 steps, shape and place are tested. | a test fails while both sides are in contact | undoing |
-    | | | 200 counted steps, and the end of earlier merges of the group | final |
-    | undoing | The joint filter goes on. The filters from before the merge replay the inputs since then, 20 steps at a time. | they have caught up, and all sides are in contact | undone |
+    | watched | The filters are one; two tests run each 20 steps in contact. | a test fails in contact | undoing |
+    | | | 200 steps in contact, and the end of earlier merges of the group | final |
+    | undoing | The joint filter goes on, while those from before the merge replay the inputs since, 20 steps at a time. | they have caught up, and all sides are in contact | undone |
     | | | the group merges again, or a fork without the monitor replaces its filter | watched |
-    | undone | The separate filters go on. Forks that split from the joint one still know its map. | the last of these forks returns | final |
+    | undone | The separate filters go on. Forks of the joint one still know its map. | the last of these forks returns | final |
     | refused | The pair waits for 25 steps or more. | | |
     | abandoned | The pair may try again at once. | | |
-    | final | Nothing is left of what it takes to undo the merge. | | |
+    | final | The merge cannot be undone any more. | | |
 
     Attempt and trial take no time. An undo of a merge undoes those on top of it, too.
 

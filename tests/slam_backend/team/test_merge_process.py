@@ -1,7 +1,6 @@
-"""A merge goes through the phases of its table, which the page on merging shows."""
+"""A merge goes through the phases of its table."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,6 @@ from slam_backend.team.branches import Branch
 from slam_backend.team.merge import Attempt, MergeProcess, Smoothing, Trial, Undoing, Watched
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
-
-PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "merging.md"
 
 
 def table() -> list[str]:
@@ -30,11 +27,6 @@ def transitions() -> set[tuple[str, str]]:
         phase = first or phase
         found |= {(phase, part.split()[0].rstrip(",")) for part in following.split(";") if part.strip()}
     return found
-
-
-def test_the_page_on_merging_has_the_table_of_the_process() -> None:
-    """Each line of the table in the docstring stands there, in the same order."""
-    assert "\n".join(table()) in PAGE.read_text(encoding="utf-8")
 
 
 def _often_refuted(number: int, trunk: Branch, *_: Any) -> bool:
