@@ -18,7 +18,7 @@ SPLIT_TRAIN, SPLIT_TRY = "train", "validation"
 EXTRAS = {  # packages of the extras for training, and how they are installed
     "train": (
         ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
-        "Install them: pip install torch==2.13.0, then pip install '.[train]' in a checkout.",
+        'Install them: pip install "vslam-env[train]".',
     ),
     "jax": (("jax", "optax"), 'Install them: pip install "vslam-env[jax]", and jax[cuda12] for an accelerator.'),
 }
