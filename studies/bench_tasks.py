@@ -3,13 +3,17 @@
 python -m studies.bench_tasks vslam-bench-v1        # minutes; VSLAM_DATA for floor plans
 """
 
-import argparse
+from typing import Annotated
+
+import typer
 
 from training.bench.exploration.plan import NO_RELAXATION, Plan, PlanTrial, task_name
 from training.bench.exploration.trials import task_digest
+from training.cli import run
 from vslam_env import vslam_v1
 
 POLICY = "frontier"  # any: tasks do not depend on it
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 def digest(plan: Plan, trial: PlanTrial) -> str:
@@ -20,23 +24,28 @@ def digest(plan: Plan, trial: PlanTrial) -> str:
 
 
 def tasks(plan: Plan) -> dict[str, str]:
-    """Return the digests of all episodes without relaxations, by track, world and number of robots."""
+    """Return the digests of all episodes without relaxations, by track, world and number of robots.
+
+    Floor plans are left out if some are missing.
+    """
     found: dict[str, dict[int, str]] = {}
-    for trial in plan.trials([POLICY], with_missing=True):
+    for trial in plan.trials([POLICY]):
         if trial.relaxation == NO_RELAXATION:
             found.setdefault(task_name(trial), {})[trial.seed] = digest(plan, trial)
     return {name: " ".join(words[seed] for seed in sorted(words)) for name, words in found.items()}
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("plan", help="name or TOML file of a plan")
-    found = tasks(Plan.load(parser.parse_args().plan))
-    print("[tasks]  # by track, world and number of robots, in order of seeds")
+@app.command()
+def main(plan: Annotated[str, typer.Argument(help="Name or TOML file of a plan.")]) -> None:
+    """Print the table [tasks] of a plan: digests of walls, landmarks, starts and first readings of each episode."""
+    loaded = Plan.load(plan)
+    if missing := loaded.missing_floor_plans():
+        typer.echo(f"Floor plans are left out: VSLAM_DATA lacks {len(missing)} of {len(loaded.floor_plans)}.", err=True)
+    found = tasks(loaded)
+    typer.echo("[tasks]  # by track, world and number of robots, in order of seeds")
     for name, words in found.items():
-        print(f'"{name}" = "{words}"')
+        typer.echo(f'"{name}" = "{words}"')
 
 
 if __name__ == "__main__":
-    main()
+    run(app, "python -m studies.bench_tasks")

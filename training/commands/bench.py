@@ -47,6 +47,10 @@ def bench_exploration(
     Episodes of a policy that raises, returns no valid action or takes too long are left out, with status 2 at the end.
     Ctrl-C finishes the current episode; the same command with --out FOLDER resumes the run.
     """
+    from slam_backend.core.validation import argument_error
+
+    if verified_rows is not None and verify is None:
+        raise argument_error("rows", "no value without --verify", verified_rows, "Omit it, or give --verify FOLDER.")
     if verify is not None:
         verify_rows(call, verify, verified_rows, workers)
         return
@@ -54,8 +58,6 @@ def bench_exploration(
         run_plan(call, plan, tracks, base, workers, ray)
         return
     if tracks is not None or base:
-        from slam_backend.core.validation import argument_error
-
         name = "tracks" if tracks is not None else "base"
         raise argument_error(name, "a plan with it", "no --plan", "Add --plan vslam-bench-v1.")
     from training.bench.exploration.report import STUDY

@@ -113,7 +113,7 @@ class GuardedTeam:
         if allowed is not None and taken is not None and taken >= allowed:
             raise PolicyError(
                 f"policy {self._name!r}: expected decisions within {allowed:g} s, got one of at least {taken:.1f} s. "
-                "Make it faster, or raise the limit."
+                "Make it faster, or raise decision_limit."
             )
 
 

@@ -35,9 +35,9 @@ def check_labels(texts: Iterable[str]) -> None:
     labels: dict[str, str] = {}
     for text in texts:
         label, policy = parted_label(text)
-        if label and labels.setdefault(label, policy) != policy:
-            hint = f"Both {labels[label]!r} and {policy!r} have it."
-            raise argument_error("policies", "a different label for each policy", label, hint)
+        if labels.setdefault(label or text, policy) != policy:
+            hint = f"Both {labels[label or text]!r} and {policy!r} have it."
+            raise argument_error("policies", "a different label for each policy", label or text, hint)
 
 
 def check_named(values: Iterable[Any], given: Any, option: str = "policies") -> None:

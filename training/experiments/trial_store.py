@@ -48,12 +48,15 @@ def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed:
     return RunFolder(out, command, values, seed, installed_versions())
 
 
-def finished_trials(file: Path, kind: type[TrialT]) -> dict[TrialT, dict[str, Any]]:
+def finished_trials(
+    file: Path, kind: type[TrialT], check: Callable[[Mapping[str, Any]], object] = bool
+) -> dict[TrialT, dict[str, Any]]:
     """Read the rows of finished trials; a last line that was cut short is left out. The file is not changed.
 
     Args:
         file: File of rows; it may not exist yet.
         kind: Frozen dataclass of the trials; a row contains its fields and the metrics.
+        check: Function that raises if the metrics of a row are damaged; the default accepts all.
 
     Raises:
         ValueError: If another line is not such a row; the text names it.
@@ -63,7 +66,9 @@ def finished_trials(file: Path, kind: type[TrialT]) -> dict[TrialT, dict[str, An
     for count, line in enumerate(lines, start=1):
         try:
             row = json.loads(line)
-            trials[trial_of(row, kind)] = row
+            trial = trial_of(row, kind)
+            check(row)
+            trials[trial] = row
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if count == len(lines) and not line.endswith("\n") and isinstance(error, json.JSONDecodeError):
                 break

@@ -284,5 +284,7 @@ def test_labels_name_policies_in_tables() -> None:
     assert [trial.policy for trial in config.trials()[:2]] == ["a=frontier", "b=frontier"]
     with pytest.raises(ValueError, match="policies: expected a different label for each policy, got 'a'"):
         ExplorationConfig(policies=("a=frontier", "a=random_goals"))
+    with pytest.raises(ValueError, match="policies: expected a different label for each policy, got 'frontier'"):
+        ExplorationConfig(policies=("frontier", "frontier=random_goals"))
     with pytest.raises(ValueError, match="policy: expected one of 'frontier'"):
         ExplorationConfig(policies=("a=unknown",))

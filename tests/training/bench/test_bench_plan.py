@@ -28,6 +28,7 @@ from training.bench.exploration.episodes import (
     episodes_csv,
     kept_episodes,
     read_episodes,
+    row_digest,
     tidy_rows,
     write_parquet,
 )
@@ -202,6 +203,7 @@ def test_floor_plans_are_found_by_their_content(tmp_path: Path, monkeypatch: pyt
         ("base = 1", "base = 3", "base: expected at most 2 seeds, got 3"),
         ("oracle_floor", "oracle_flour", "oracle_flour"),
         ("= [", "= ", "plan: expected a file in TOML"),
+        ('name = "tiny"', 'name = "vslam-bench-v1"', "plan: expected another name for a changed plan"),
     ],
 )
 def test_bad_plans_are_refused(old: str, new: str, says: str, tmp_path: Path) -> None:
@@ -271,9 +273,11 @@ def test_tracks_and_parts_of_a_plan_are_chosen(vslam: Any, tiny: Path, tmp_path:
     assert read_results(tmp_path / "base").rows
     done = vslam("bench", "leaderboard", str(tmp_path / "team"), "--out", str(tmp_path / "page.md"))
     assert "folders: expected complete results, got" in done.err
+    assert "Play the base part in a new folder: --base --out NEW." in done.err
     for options, says in (
         (("--tracks", "teams"), "tracks: expected one of 'standard', 'team', got 'teams'"),
         (("--base", "--quick"), "base: expected no value with --quick"),
+        (("--rows", "3"), "rows: expected no value without --verify, got 3"),
     ):
         assert says in vslam(*command, *options).err
     assert "tracks: expected a plan with it" in vslam("bench", "exploration", "--tracks", "team").err
@@ -294,9 +298,13 @@ def test_episodes_are_played_again(vslam: Any, run: Path) -> None:
     changed = [json.dumps({**row, "policy_digest": "0" * 16}) for row in _rows(run)]
     (run / TRIALS_FILE).write_text("\n".join(changed) + "\n")
     assert "The file of frontier" in vslam(*verify, "--rows", "1").out
-    forged = [json.dumps({**row, "digest": "0" * 32}) for row in _rows(run)]
-    (run / TRIALS_FILE).write_text("\n".join(forged) + "\n")
-    assert vslam(*verify, "--rows", "1").status == 1
+    for change in ({"digest": "0" * 32}, {"map_error": 0.02}):
+        forged = [json.dumps({**row, **change}) for row in _rows(run)]
+        (run / TRIALS_FILE).write_text("\n".join(forged) + "\n")
+        assert vslam(*verify, "--rows", "1").status == 1
+    damaged = [{name: value for name, value in row.items() if name != "map_error"} for row in map(json.loads, forged)]
+    (run / TRIALS_FILE).write_text("\n".join(map(json.dumps, damaged)) + "\n")
+    assert "out: expected a trial in each line, got a damaged line 1" in vslam(*verify).err
     for name in (TRIALS_FILE, verification.VERIFIED_FILE):
         (run / name).unlink()  # kept results have compressed rows alone
     rows = (run / CSV).read_text().replace(machine_module.PACKAGES[0], "another package")
@@ -578,14 +586,20 @@ def test_rows_must_be_those_of_the_plan(forged: Any) -> None:
 
 
 def test_invented_comparisons_do_not_count(forged: Any) -> None:
-    """Lines without a digest of the rows, or of another command, verify nothing; damaged ones are named."""
+    """Lines of other rows, of rows that say something else by now, or of another command verify nothing.
+
+    Damaged lines are named.
+    """
     rows = forged().rows
     good = {"date": "2026-01-01", "by": f"{verification.COMMAND} 0.3.0", "is_equal": True, "is_close": True}
-    lines = [{**good, "policy": "frontier", "digest": f"{k:032x}"} for k in range(5000)]
-    lines += [{**good, "policy": row["policy"], "digest": row["digest"], "by": "my own program"} for row in rows]
-    lines += [{**good, "policy": "tare", "digest": row["digest"]} for row in rows]
+    lines = [{**good, "policy": "frontier", "digest": f"{k:032x}", "row": "0"} for k in range(5000)]
+    of_rows = [{**good, "policy": row["policy"], "digest": row["digest"], "row": row_digest(row)} for row in rows]
+    lines += [{**line, "by": "my own program"} for line in of_rows]
+    lines += [{**line, "policy": "tare"} for line in of_rows]
+    better = [{**row, "map_error": 0.5 * row["map_error"]} for row in rows]
+    lines += [{**line, "row": row_digest(row)} for line, row in zip(of_rows, better, strict=True)]
     assert forged(verified="\n".join(map(json.dumps, lines))).again == {}
-    lines = [{**good, "policy": row["policy"], "digest": row["digest"]} for row in rows for _ in range(3)]
+    lines = [line for line in of_rows for _ in range(3)]
     text = "\n".join(map(json.dumps, lines))
     counts = forged(verified=text).again
     assert counts == {"frontier": [COUNT - 6, 0, 0], "random_walk": [6, 0, 0]}

@@ -2,6 +2,7 @@
 
 import csv
 import gzip
+import hashlib
 import io
 import math
 import zlib
@@ -59,6 +60,10 @@ class Field(NamedTuple):
             return value
         raise ValueError
 
+    def cell(self, value: Any) -> str:
+        """Return the cell of a value, the same for what was measured and for what `parsed` returns."""
+        return "" if value is None else f"{value:.6g}" if self.kind is float else str(value)
+
 
 TEXT, SHARE, COUNT, AMOUNT = Field(str), Field(float, 0.0, 1.0), Field(int), Field(float)
 FIELDS: dict[str, Field] = {
@@ -74,6 +79,22 @@ FIELDS: dict[str, Field] = {
     "action_type": TEXT, "task": TEXT, "digest": TEXT, "policy_digest": TEXT, "version": TEXT, "machine": TEXT,
     **{f"{REFUSED}{reason}": COUNT for reason in REASONS},
 }  # fmt: skip   # a policy without a file of its own has an empty digest
+
+
+def row_digest(row: Mapping[str, Any]) -> str:
+    """Return the first 16 hexadecimal digits of SHA-256 over what a table of episodes says of an episode."""
+    (tidy,) = tidy_rows([row])
+    return hashlib.sha256(repr([FIELDS[name].cell(value) for name, value in tidy.items()]).encode()).hexdigest()[:16]
+
+
+def check_row(row: Mapping[str, Any]) -> None:
+    """Refuse a row that lacks a column, or has a value out of range.
+
+    Raises:
+        KeyError, TypeError, ValueError: If it does.
+    """
+    for name, value in tidy_rows([row])[0].items():
+        FIELDS[name].parsed(FIELDS[name].cell(value))
 
 
 def tidy_rows(rows: Rows) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from slam_backend.core.validation import argument_error
 from training.bench.exploration.episodes import kept_episodes
-from training.bench.exploration.plan import BASE, FLOOR_PLANS, Plan, PlanTrial
+from training.bench.exploration.plan import BASE, FLOOR_PLANS, QUICK, Plan, PlanTrial
 from training.bench.exploration.plan_report import incomplete, markdown, shown
 from training.bench.exploration.verification import COMMAND as VERIFY
 from training.bench.exploration.verification import OUTCOMES, TENTH, replayed
@@ -55,8 +55,9 @@ def read_results(folder: Path) -> Results:
     plan = Plan.of_run(folder, values, "folders")
     _check_rows(plan, rows, folder)
     if lacking := incomplete(plan, rows, ()):
-        hint = f"Resume the run in {str(folder)!r}, without --quick."
-        raise argument_error("folders", "complete results", f"a folder in which {lacking[0]}", hint)
+        whole = f"Go on with the command that began {str(folder)!r}."
+        hint = "Play the base part in a new folder: --base --out NEW." if values.get("extent") == QUICK else whole
+        raise argument_error("folders", "complete results", f"a folder in which {', '.join(lacking)}", hint)
     return Results(plan, rows, replayed(folder, rows))
 
 
@@ -125,7 +126,7 @@ def leaderboard(results: Sequence[Results], figure: str) -> str:
     again = ResultTable(
         name="status", title="Status", by=("policy", "version"), words={"policy": ("policy", shown)},
         columns=(
-            Column("status", "status", partial(_status, counts)), Column("episodes", statistic=len, digits=0),
+            Column("status", "status", partial(status, counts)), Column("episodes", statistic=len, digits=0),
             *(
                 Column(outcome, "" if i else f"again: {outcome}", partial(_again, counts, i), digits=0)
                 for i, outcome in enumerate(OUTCOMES)
@@ -155,8 +156,8 @@ def latest_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:
     return [row for row in rows if _numbers(row["version"]) == latest]
 
 
-def _status(counts: Mapping[str, Sequence[int]], rows: Rows) -> str:
-    """Return whether enough episodes of a policy were played again, all with the same results."""
+def status(counts: Mapping[str, Sequence[int]], rows: Rows) -> str:
+    """Return "replayed" if enough episodes of a policy were played again, all with the same results, or "claimed"."""
     *same, different = counts.get(rows[0]["policy"], (0, 0, 0))
     return "replayed" if not different and sum(same) >= TENTH * len(rows) else "claimed"
 

@@ -115,6 +115,10 @@ class Plan(Checked):
             known = [path.stem for path in sorted(PLANS.glob("*.toml"))]
             raise choice_error("plan", source, known, "Check the spelling.", ", or the path of a TOML file")
         values = read_toml(file, "plan")
+        shipped = PLANS / f"{values.get('name')}.toml"
+        if shipped.is_file() and values != read_toml(shipped, "plan"):
+            hint = f"Change the field name of {str(file)!r}."
+            raise argument_error("plan", "another name for a changed plan", shipped.stem, hint)
         try:
             return cls(**values)
         except ValueError as error:

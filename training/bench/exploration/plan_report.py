@@ -81,6 +81,7 @@ def tables(plan: Plan, rows: Rows) -> list[ResultTable]:
                 Column("below_50_s", "T50 [s]", digits=0), Column("below_90_s", "T90 [s]", digits=0),
                 Column("overlap", "overlap [%]", digits=0, factor=CM), Column("way_m", "path [m]", digits=0),
                 Column("balance", digits=2), Column("collisions", "collisions [s]", digits=1, factor=0.1),
+                Column("invalid_actions", "invalid", digits=1),
                 Column("bytes_sent", "sent [kB]", digits=0, factor=1e-3),
                 Column("decision_ms", "decision [ms]", digits=1), Column("decision_p99_ms", "p99 [ms]", digits=1),
             ),

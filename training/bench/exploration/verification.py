@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_backend.core.files import append_text
 from slam_backend.core.validation import argument_error
-from training.bench.exploration.episodes import bounded_bytes
+from training.bench.exploration.episodes import bounded_bytes, row_digest
 from training.bench.exploration.players import label
 from training.experiments.statistics import grouped
 from training.experiments.study import Column, ResultTable
@@ -41,7 +41,7 @@ def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, An
     """Return a stored row's comparison with its repetition.
 
     `is_equal` is None where numerics or versions differ, so that last bits may, too; `is_close` tells whether all
-    results are the same there, numbers up to `CLOSE`.
+    results are the same, numbers up to `CLOSE`. `row` is the `row_digest` of a stored row of a plan.
     """
     comparable = stored["machine"] == again["machine"]
     return {
@@ -49,6 +49,7 @@ def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, An
         "is_close": all(_close(value, again[name]) for name, value in stored.items() if name not in NOT_COMPARED),
         "is_other_policy": (stored["policy_digest"] or "") != again["policy_digest"],
         "digest": stored["digest"], "again": again["digest"], "machine": again["machine"],
+        "row": row_digest(stored) if "track" in stored else None,
         "stored_on": stored["machine"], "map_error": stored["map_error"], "map_error_again": again["map_error"],
         "more": again["map_error"] - stored["map_error"],
     }  # fmt: skip
@@ -62,28 +63,35 @@ def keep(folder: Path, comparison: Mapping[str, Any], trial: Mapping[str, Any]) 
 
 def outcome_counts(comparisons: Rows) -> list[int]:
     """Return the numbers of comparisons with each of `OUTCOMES`: the second is found where last bits may differ."""
-    outcomes = [OUTCOMES[_outcome(row)] for row in comparisons]
+    outcomes = [outcome_of(row) for row in comparisons]
     return [outcomes.count(outcome) for outcome in OUTCOMES]
+
+
+def outcome_of(comparison: Mapping[str, Any]) -> str:
+    """Return which of `OUTCOMES` a comparison has: what a row says must be what was played, whatever its digest."""
+    if comparison["is_equal"] is False or not comparison["is_close"]:
+        return OUTCOMES[2]
+    return OUTCOMES[1] if comparison["is_equal"] is None else OUTCOMES[0]
 
 
 def replayed(folder: Path, rows: Rows) -> dict[str, list[int]]:
     """Return the `outcome_counts` of each policy of a run folder, each of its episodes once, by its last comparison.
 
-    A comparison counts if `COMMAND` made it, of an episode with the policy and the digest that a row has.
+    A comparison counts if `COMMAND` made it, of an episode of which a row still says the same.
 
     Raises:
         ValueError: If the file is too large, or a line is none that the command writes; the text names it.
     """
     file = folder / VERIFIED_FILE
     lines = bounded_bytes(file, "folders").decode(errors="replace").splitlines() if file.is_file() else []
-    known = {(row["policy"], row["digest"]) for row in rows}
-    last: dict[tuple[str, str], Mapping[str, Any]] = {}
+    known = {(row["policy"], row["digest"], row_digest(row)) for row in rows}
+    last: dict[tuple[str, str, str], Mapping[str, Any]] = {}
     for count, text in enumerate(lines, start=1):
         line = _comparison(text)
         if line is None:
             hint = f"Remove line {count} of {str(file)!r}, and play its episode again."
             raise argument_error("folders", "a comparison in each line", f"a damaged line {count}", hint)
-        episode = line["policy"], line["digest"]
+        episode = line["policy"], line["digest"], line["row"]
         if episode in known and line["by"].startswith(COMMAND):
             last[episode] = line
     return {policy: outcome_counts(group) for (policy,), group in grouped(last.values(), ("policy",)).items()}
@@ -96,17 +104,11 @@ def _comparison(text: str) -> Mapping[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     if not isinstance(line, dict) or not all(
-        isinstance(line.get(name), str) for name in ("by", "policy", "digest", "date")
+        isinstance(line.get(name), str) for name in ("by", "policy", "digest", "row", "date")
     ):
         return None
     is_sound = type(line.get("is_close")) is bool and type(line.get("is_equal", "")) in (bool, type(None))
     return line if is_sound else None
-
-
-def _outcome(comparison: Mapping[str, Any]) -> int:
-    if comparison["is_equal"] is None:
-        return 1 if comparison["is_close"] else 2
-    return 0 if comparison["is_equal"] else 2
 
 
 def _close(stored: Any, again: Any) -> bool:

@@ -51,7 +51,7 @@ def run_plan(
 ) -> None:
     """Play the episodes of a plan that the run folder does not contain yet, and write its tables."""
     from slam_backend.core.text_files import read_text
-    from training.bench.exploration.episodes import CSV, PARQUET, episodes_csv, write_parquet
+    from training.bench.exploration.episodes import CSV, PARQUET, check_row, episodes_csv, write_parquet
     from training.bench.exploration.plan import PLAN_COPY, PlanBench, PlanTrial
     from training.bench.exploration.plan_report import draw_plan, markdown, ordered, tables
     from training.bench.exploration.trials import check_same_policies, checks, play
@@ -74,7 +74,7 @@ def run_plan(
         console.print(text, soft_wrap=True)
     part = TrialSet(
         kind=PlanTrial, play=partial(play, bench), trials=trials, workers=workers, cluster=cluster,
-        variables=variables_for(PORTABLE),
+        check=check_row, variables=variables_for(PORTABLE),
     )  # fmt: skip
     rows = run_trial_set(console, folder, part)
     found = [(table, lines) for table in tables(plan, rows) if (lines := table.lines(ordered(plan, rows)))]
@@ -150,15 +150,16 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int | None, 
     Processes that play them have the numerics of the stored ones, where this processor can do these.
 
     Raises:
-        typer.Exit: With status 1 if an episode differs from one of the same numerics and versions.
+        typer.Exit: With status 1 if an episode differs from what the run says of it, with the same numerics and
+            versions.
     """
     import numpy as np
 
     from slam_backend.core.validation import argument_error
-    from training.bench.exploration.episodes import kept_episodes
+    from training.bench.exploration.episodes import check_row, kept_episodes
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import Bench, play
-    from training.bench.exploration.verification import TABLE, choose, compare, keep
+    from training.bench.exploration.verification import OUTCOMES, TABLE, choose, compare, keep, outcome_of
     from training.experiments.machine.numerics import variables_for
     from training.experiments.policy_names import check_named
     from training.experiments.run_folder import CONFIG_FILE, read_config
@@ -174,7 +175,7 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int | None, 
         bench, kind = PlanBench(plan, float(values["decision_limit"])), PlanTrial
     else:
         bench = ExplorationConfig.from_mapping(values | {"seed": seed})
-    stored = finished_trials(folder / TRIALS_FILE, kind)
+    stored = finished_trials(folder / TRIALS_FILE, kind, check_row if kind is PlanTrial else bool)
     chosen = choose(list(stored.values()) or kept_episodes(folder, "verify") or [], count, np.random.default_rng())
     if not chosen or any("digest" not in row for row in chosen):
         hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."
@@ -204,7 +205,7 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int | None, 
     if changed:
         text = f"The file of {', '.join(changed)} is another one than when the episodes were played."
         call.console.print(text, soft_wrap=True)
-    if any(row["is_equal"] is False for row in outcomes):
+    if any(outcome_of(row) == OUTCOMES[-1] for row in outcomes if row["is_equal"] is not None):
         raise typer.Exit(1)
 
 
@@ -233,10 +234,14 @@ def write_leaderboard(folders: list[Path], out: Path) -> None:
 
 def write_submission(folder: Path, out: Path) -> None:
     """Write the files of a submission, and say what to do with them."""
+    from training.bench.exploration.leaderboard import status
     from training.bench.exploration.players import label
     from training.bench.exploration.submission import submit
+    from training.experiments.statistics import grouped
 
     results = submit(folder, out)
     policies = ", ".join(label(policy) for policy in dict.fromkeys(row["policy"] for row in results.rows))
     typer.echo(f"Submission of {policies}: {out}")
+    for (policy,), rows in grouped(results.rows, ("policy",)).items():
+        typer.echo(f"{label(policy)} is {status(results.again, rows)}, with {len(rows)} episodes.")
     typer.echo(f"Add this folder to benchmarks/{results.plan.name} in a pull request.")

@@ -82,6 +82,7 @@ class TrialSet:
     trials: Sequence[Any]  # All trials, in order
     workers: int = 1  # Number of parallel processes; 1: this process, unless there are variables
     cluster: str | None = None  # Address of a Ray cluster that runs the trials instead; None: this machine
+    check: Callable[[Mapping[str, Any]], object] = bool  # Function that raises if a stored row is damaged
     variables: Mapping[str, str] | None = None  # Variables of the environment of the processes that run the trials
     failures: list[str] = field(default_factory=list)  # Errors of failed trials, appended as they end
 
@@ -102,7 +103,7 @@ def _run_owned(console: Console, folder: "RunFolder", part: TrialSet, timed: boo
     """Run the missing trials of a folder that no other process uses; see `run_trial_set`."""
     from training.experiments.trial_store import FAILED, TRIALS_FILE, finished_trials, run_trials, trial_of
 
-    found = finished_trials(folder.path / TRIALS_FILE, part.kind)
+    found = finished_trials(folder.path / TRIALS_FILE, part.kind, part.check)
     left, wanted = [trial for trial in part.trials if trial not in found], len(part.trials)
     if found:
         text = f"Resuming {folder.path}: {wanted - len(left)} of {wanted} trials are finished, {len(left)} are left."
