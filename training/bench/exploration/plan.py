@@ -116,7 +116,7 @@ class Plan(Checked):
             raise choice_error("plan", source, known, "Check the spelling.", ", or the path of a TOML file")
         values = read_toml(file, "plan")
         shipped = PLANS / f"{values.get('name')}.toml"
-        if shipped.is_file() and values != read_toml(shipped, "plan"):
+        if shipped.is_file() and {**values, "policies": None} != {**read_toml(shipped, "plan"), "policies": None}:
             hint = f"Change the field name of {str(file)!r}."
             raise argument_error("plan", "another name for a changed plan", shipped.stem, hint)
         try:
