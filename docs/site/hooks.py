@@ -25,7 +25,6 @@ NOTEBOOKS = DOCS / "notebooks"
 SECTION = re.compile(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 MODULE = re.compile(r"^\| `([\w.]+)` \|", re.MULTILINE)
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:]+)\)")
-HIDDEN = re.compile(r"^#+ `vslam [^`]+`\n\n\*\*Usage\*\*.*?(?=^#|\Z)", re.MULTILINE | re.DOTALL)
 SAID = re.compile(r"^#+ `(vslam [^`]+)`\n\n(.+?)\n\n", re.MULTILINE | re.DOTALL)
 GROUP = re.compile(r"^\$ (vslam[\w -]*?) \[OPTIONS\] COMMAND.*?(?=^#|\Z)", re.MULTILINE | re.DOTALL)
 SUMMARY = re.compile(r"^\* `([a-z][\w-]*)`: .*$", re.MULTILINE)
@@ -65,7 +64,7 @@ def made_pages() -> dict[str, str]:
 
 
 def commands_page() -> str:
-    """Return the page of all commands with their options and defaults, without those that say nothing of themselves.
+    """Return the page of all commands with their options and defaults.
 
     Lists of commands have whole first paragraphs, of which typer leaves 45 letters.
     """
@@ -76,7 +75,6 @@ def commands_page() -> str:
 
     command = typer.main.get_command(app)
     text = get_docs_for_click(obj=command, ctx=typer.Context(command, info_name="vslam"), name="vslam")
-    text = HIDDEN.sub("", text)
     summaries = {name: " ".join(said.split()) for name, said in SAID.findall(text)}
 
     def with_summaries(group: re.Match[str]) -> str:

@@ -127,10 +127,9 @@ def test_keywords_name_pages_with_these_words(sources: dict[str, str]) -> None:
 
 
 def test_the_page_of_commands_has_all_options(hooks: Any) -> None:
-    """Each command that says something of itself is a section, and is listed with it; options have their defaults."""
+    """Each command is a section, and is listed with what it says of itself; options have their defaults."""
     text = hooks.commands_page()
     assert "* `merge`: Align two landmark maps from files and merge them, or say why not." in text
-    assert "vslam bench accuracy" not in text
     assert {"## `vslam run`", "### `vslam bench exploration`", "## `vslam evaluate`"} <= set(text.splitlines())
     own = text.split("## `vslam evaluate`")[1].split("\n## ")[0]
     assert "* `--world-split <str>`: Split of the worlds: validation or test.  [default: (validation)]" in own

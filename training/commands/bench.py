@@ -140,24 +140,3 @@ def speed_start(call: Call[StartSpeedConfig]) -> None:
     from training.bench.speed.start import STUDY
 
     run_study(call, STUDY)
-
-
-def _say_where(name: str, hint: str) -> None:
-    """Add a hidden command that says where a command has gone."""
-
-    @bench.command(name, hidden=True, context_settings={"ignore_unknown_options": True})
-    def moved(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
-        from slam_backend.core.validation import argument_error
-
-        raise argument_error("bench", "another command", name, hint)
-
-
-MOVED = {
-    "accuracy": "filters.accuracy or studies.filters.losses", "alignment": "merging.alignment",
-    "mrclam": "merging.mrclam_pairs", "scale": "environment.scale", "stereo": "front_end.stereo",
-    "train": "learning.speed",
-}  # fmt: skip
-for _name, _study in MOVED.items():
-    _say_where(_name, f"In a clone: python -m studies.{_study}.")
-for _name in ("filter", "env", "start"):
-    _say_where(_name, f"Use vslam bench speed {_name}.")

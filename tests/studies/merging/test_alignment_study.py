@@ -144,16 +144,3 @@ def test_the_program_writes_tables_chart_and_trials(tmp_path: Path) -> None:
     assert subprocess.run(program, capture_output=True, check=True).returncode == 0
     assert (out / "trials.jsonl").read_text() == rows
     assert "study alignment" in (out / "config.toml").read_text()
-
-
-def test_the_old_command_names_the_program() -> None:
-    """It is one line, whatever options it is given."""
-    said = subprocess.run(
-        [sys.executable, "-m", "vslam_env", "bench", "alignment", "--seeds", "3"], capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
-    assert said.returncode == 2
-    assert (
-        said.stderr
-        == "error bench: expected another command, got 'alignment'. In a clone: python -m studies.merging.alignment.\n"
-    )

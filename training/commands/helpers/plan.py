@@ -240,8 +240,7 @@ def write_submission(folder: Path, out: Path) -> None:
     from training.experiments.statistics import grouped
 
     results = submit(folder, out)
-    policies = ", ".join(label(policy) for policy in dict.fromkeys(row["policy"] for row in results.rows))
-    typer.echo(f"Submission of {policies}: {out}")
+    typer.echo(f"Submission: {out}")
     for (policy,), rows in grouped(results.rows, ("policy",)).items():
-        typer.echo(f"{label(policy)} is {status(results.again, rows)}, with {len(rows)} episodes.")
+        typer.echo(f"{label(policy)}: {len(rows)} episodes, {status(results.again, rows)}.")
     typer.echo(f"Add this folder to benchmarks/{results.plan.name} in a pull request.")
