@@ -7,7 +7,7 @@ from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[1]  # of this project's packages
 PLAIN_NAMES = ("agents", "training")  # packages that another file or package may hide
-BAD_INPUT = 2
+BAD_INPUT, INTERRUPTED = 2, 130
 
 
 def main() -> None:
@@ -19,7 +19,10 @@ def main() -> None:
         print(f"error {error}", file=sys.stderr)
         sys.exit(BAD_INPUT)
     # Loaded by name: layers do not import those above, and the package of a command is the only exception.
-    import_module("training.cli").main()
+    try:
+        import_module("training.cli").main()
+    except KeyboardInterrupt:  # while it is loaded; commands handle their own
+        sys.exit(INTERRUPTED)
 
 
 def check_package(name: str) -> None:

@@ -42,9 +42,11 @@ def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed:
     values, kept_seed = read_config(out, command)
     asked = {name: value for name, value in plain(config).items() if value is not None}  # TOML has no None
     if (values, kept_seed) != (asked, seed):
+        kept, new = values | {"seed": kept_seed}, asked | {"seed": seed}
+        other = ", ".join(name for name in kept | new if kept.get(name) != new.get(name))
         hint = f"Repeat the options in {str(out / CONFIG_FILE)!r}, or choose another folder."
         expected = f"a folder of the same {command.split()[0]} run"
-        raise argument_error("out", expected, "a folder of a run with other options", hint)
+        raise argument_error("out", expected, f"a folder of a run with another {other}", hint)
     return RunFolder(out, command, values, seed, installed_versions())
 
 

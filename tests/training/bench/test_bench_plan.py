@@ -318,6 +318,8 @@ def test_episodes_are_played_again(vslam: Any, run: Path) -> None:
     (run / PACKED).write_bytes(gzip.compress(_changed(rows, map_error=lambda text: str(1.001 * float(text))).encode()))
     assert vslam(*verify, "--rows", "1").status == 0  # allowed elsewhere
     assert outcomes() == {"frontier": [0, 0, 1], "random_walk": [0, 0, 1]}
+    (run / verification.VERIFIED_FILE).write_text("garbage\n")
+    assert "verify: expected a comparison in each line, got a damaged line 1" in vslam(*verify).err
 
 
 @pytest.mark.slow
@@ -496,8 +498,10 @@ def test_values_out_of_range_cost_one_line(name: str, text: str, expected: str) 
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (b"policy\nfrontier\n", "the columns of an episode"),
-        (b"", "the columns of an episode"),
+        (b"policy\nfrontier\n", "a column 'track' in the first line, got 'none'"),
+        (b"", "a column 'track' in the first line, got 'none'"),
+        (b"HEAD,x,y\n", "only columns of an episode, each once, in the first line, got 'x'"),
+        (b"HEAD,track\n", "only columns of an episode, each once, in the first line, got 'track'"),
         (b"\xff\xfe", "a table of episodes"),
         (b'"', "a table of episodes"),
         (b"x" * 200_000, "a table of episodes"),

@@ -4,7 +4,7 @@ import sys
 import tomllib
 from importlib.metadata import EntryPoint, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 from typer.main import get_command
@@ -23,6 +23,18 @@ def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(cli, "app", broken)
     with pytest.raises(ValueError, match="broadcast"):
         cli.main()
+
+
+def test_an_interrupt_while_the_program_is_loaded_is_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The status is that of an interrupted command."""
+
+    def interrupted(name: str) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(entry, "import_module", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        entry.main()
+    assert ended.value.code == cli.INTERRUPTED
 
 
 def test_the_list_of_commands_says_what_each_says_of_itself() -> None:

@@ -135,6 +135,8 @@ def test_first_steps_come_before_the_folder(tmp_path: Path) -> None:
     assert _call({"many": 3}, out=out, continues=True).begin()[1] == folder
     with pytest.raises(ValueError, match="out: expected a new or empty folder, got a folder with files"):
         _call({"many": 3}, out=out).begin()
+    with pytest.raises(ValueError, match="got a folder of a run with another many"):
+        _call({"many": 4}, out=out, continues=True).begin()
 
 
 @pytest.mark.parametrize("below", [False, True])

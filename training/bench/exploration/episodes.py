@@ -172,8 +172,10 @@ def read_episodes(content: bytes, name: str, argument: str = "folders") -> list[
         lines = csv.reader(io.StringIO(content.decode()), strict=True)
         head = next(lines, [])
         if sorted(head) != sorted(FIELDS):
-            odd = sorted(set(FIELDS).symmetric_difference(head)) or head
-            raise argument_error(argument, "the columns of an episode", f"a table that differs in {odd[0]!r}", hint)
+            if missing := [name for name in FIELDS if name not in head]:
+                raise argument_error(argument, f"a column {missing[0]!r} in the first line", "none", hint)
+            other = next(name for name in head if name not in FIELDS or head.count(name) > 1)
+            raise argument_error(argument, "only columns of an episode, each once, in the first line", other, hint)
         return [_row(head, cells, lines.line_num, argument, hint) for cells in lines]
     except (csv.Error, UnicodeDecodeError) as error:
         raise argument_error(argument, "a table of episodes", f"none: {error}", hint) from error

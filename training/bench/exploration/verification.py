@@ -74,7 +74,7 @@ def outcome_of(comparison: Mapping[str, Any]) -> str:
     return OUTCOMES[1] if comparison["is_equal"] is None else OUTCOMES[0]
 
 
-def replayed(folder: Path, rows: Rows) -> dict[str, list[int]]:
+def replayed(folder: Path, rows: Rows, argument: str = "folders") -> dict[str, list[int]]:
     """Return the `outcome_counts` of each policy of a run folder, each of its episodes once, by its last comparison.
 
     A comparison counts if `COMMAND` made it, of an episode of which a row still says the same.
@@ -83,14 +83,14 @@ def replayed(folder: Path, rows: Rows) -> dict[str, list[int]]:
         ValueError: If the file is too large, or a line is none that the command writes; the text names it.
     """
     file = folder / VERIFIED_FILE
-    lines = bounded_bytes(file, "folders").decode(errors="replace").splitlines() if file.is_file() else []
+    lines = bounded_bytes(file, argument).decode(errors="replace").splitlines() if file.is_file() else []
     known = {(row["policy"], row["digest"], row_digest(row)) for row in rows}
     last: dict[tuple[str, str, str], Mapping[str, Any]] = {}
     for count, text in enumerate(lines, start=1):
         line = _comparison(text)
         if line is None:
             hint = f"Remove line {count} of {str(file)!r}, and play its episode again."
-            raise argument_error("folders", "a comparison in each line", f"a damaged line {count}", hint)
+            raise argument_error(argument, "a comparison in each line", f"a damaged line {count}", hint)
         episode = line["policy"], line["digest"], line["row"]
         if episode in known and line["by"].startswith(COMMAND):
             last[episode] = line

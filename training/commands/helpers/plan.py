@@ -159,7 +159,7 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int | None, 
     from training.bench.exploration.episodes import check_row, kept_episodes
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import Bench, play
-    from training.bench.exploration.verification import OUTCOMES, TABLE, choose, compare, keep, outcome_of
+    from training.bench.exploration.verification import OUTCOMES, TABLE, choose, compare, keep, outcome_of, replayed
     from training.experiments.machine.numerics import variables_for
     from training.experiments.policy_names import check_named
     from training.experiments.run_folder import CONFIG_FILE, read_config
@@ -176,7 +176,10 @@ def verify_rows(call: Call[ExplorationConfig], folder: Path, count: int | None, 
     else:
         bench = ExplorationConfig.from_mapping(values | {"seed": seed})
     stored = finished_trials(folder / TRIALS_FILE, kind, check_row if kind is PlanTrial else bool)
-    chosen = choose(list(stored.values()) or kept_episodes(folder, "verify") or [], count, np.random.default_rng())
+    rows_of_run = list(stored.values()) or kept_episodes(folder, "verify") or []
+    if kind is PlanTrial:
+        replayed(folder, rows_of_run, "verify")  # its errors, before anything is played
+    chosen = choose(rows_of_run, count, np.random.default_rng())
     if not chosen or any("digest" not in row for row in chosen):
         hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."
         raise argument_error("verify", "a run folder whose episodes have digests", "none", hint)
