@@ -132,7 +132,7 @@ def markdown(plan: Plan, rows: Rows, policies: Sequence[str]) -> str:
     if plan.floor_plans and not _of(rows, family=FLOOR_PLANS):
         parts.append("There are no rows of floor plans: they need `VSLAM_DATA`, and are no part of the base.\n")
     if empty := [name for name in plan.all_tracks if not _of(rows, track=name)]:
-        parts.append(f"There are no rows of the tracks {', '.join(empty)}.\n")
+        parts.append(f"Tracks without rows: {', '.join(empty)}.\n")
     parts += [f"Not a complete result: {text}.\n" for text in incomplete(plan, rows, policies)]
     for table, title, headings, cells in sections(plan, rows):
         note = f"{table.note}\n\n" if table.note else ""
